@@ -1,0 +1,64 @@
+# Everything runs in .venv, which the first target creates. Nothing is fetched once it stands.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+TREE := build/tree
+# One torch thread per worker: two workers with a thread pool each would fight over two cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
+
+.DEFAULT_GOAL := help
+.PHONY: help demo install test test-slow check format bench tree clean
+
+help:
+	@echo "make demo       install, then run the demonstration"
+	@echo "make install    create .venv and install the pinned versions"
+	@echo "make test       every test but the learning tests"
+	@echo "make test-slow  the learning tests"
+	@echo "make check      format, lint, types, doctests"
+	@echo "make format     rewrite the code as 'make check' wants it"
+	@echo "make bench      throughput measurements"
+	@echo "make clean      remove builds and caches (.venv and runs stay)"
+
+install: $(STAMP)
+
+# torch and the build back end first: torch is the one large download, and with setuptools in place
+# the editable install needs no isolated build environment, so it uses the pinned one.
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch setuptools wheel
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[dev]'
+	touch $@
+
+demo: $(STAMP)
+	$(BIN)/torchrl-mcp-demo
+
+test: $(STAMP)
+	$(PYTEST) -n 2 -m "not slow"
+
+test-slow: $(STAMP)
+	$(PYTEST) -n 2 -m slow
+
+# mypy and doctest read folders, not import hooks, and so cannot see that envs/ is torchrl_mcp.envs.
+# They get a tree of links in which it is.
+tree:
+	rm -rf $(TREE)
+	mkdir -p $(TREE)/torchrl_mcp
+	cd $(TREE)/torchrl_mcp && ln -s ../../../torchrl_mcp/* ../../../envs ../../../conf .
+
+check: $(STAMP) tree
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	cd $(TREE) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p torchrl_mcp
+	cd $(TREE) && PYTHONPATH=. OMP_NUM_THREADS=1 ../../$(BIN)/pytest --doctest-modules torchrl_mcp
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	for script in benchmarks/*.py; do $(BIN)/python "$$script" || exit 1; done
+
+clean:
+	rm -rf build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find torchrl_mcp envs conf tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true

@@ -1,0 +1,218 @@
+"""What the environments of all characters and tasks share."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_mcp.envs.rendering import Arrow, Camera
+from torchrl_mcp.envs.simulation import LARGEST, Simulation
+
+
+class CharacterEnv(EnvBase):
+    """N copies of a character with a task, simulated side by side in one process.
+
+    A task says what is observed, rewarded and ended and how an episode begins, in the methods at the end of this class.
+    The class owns stepping, specs, partial resets, seeding, the time limit, snapshots and faults. What a task remembers
+    beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
+
+    A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward 0
+    and the observation from before the step, and ``num_faults`` counts it.
+
+    Args:
+        model: Character and scene.
+        num_envs: Number N of simulations.
+        substeps: Physics steps per action.
+        max_episode_steps: Actions until an episode is ``truncated``.
+        episode: Initial values of what the task remembers, each ``(N, ...)``.
+        outputs: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
+        seed: Seed of ``generator``, or None to draw one.
+        num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
+        persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
+        dtype: Type of what is emitted; physics and reward are computed in float64.
+        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+
+    batch_locked = True
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        *,
+        substeps: int,
+        max_episode_steps: int,
+        episode: Mapping[str, Tensor],
+        outputs: Sequence[str] = (),
+        seed: int | None = None,
+        num_threads: int = 0,
+        persistent: bool = False,
+        dtype: torch.dtype = torch.float32,
+        pin_memory: bool = False,
+    ) -> None:
+        least = {"num_envs": (num_envs, 1), "max_episode_steps": (max_episode_steps, 1), "num_threads": (num_threads, 0)}
+        for name, (value, bound) in least.items():
+            if value < bound:
+                raise ValueError(f"{name}={value} is too small: pass at least {bound}")
+        if pin_memory and not torch.cuda.is_available():
+            raise ValueError("pin_memory=True speeds up copies to a CUDA device, and none is available: pass False")
+        super().__init__(device="cpu", batch_size=[num_envs])
+        self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
+        self.control_timestep = substeps * model.opt.timestep
+        self.simulation = Simulation(
+            model, num_envs, substeps=substeps, outputs=outputs, num_threads=num_threads, persistent=persistent
+        )
+        self.episode = {"elapsed_steps": torch.zeros(num_envs, 1, dtype=torch.int64), **episode}
+        self.num_faults = 0
+        self._snapshot: TensorDict | None = None
+        self.generator = torch.Generator()
+        self.set_seed(seed)
+        self._dtype, self._pin_memory = dtype, pin_memory
+        self._cameras: dict[tuple[int, int], Camera] = {}
+
+    @property
+    def physics_seconds(self) -> float:
+        """Wall-clock seconds spent inside MuJoCo so far."""
+        return self.simulation.physics_seconds
+
+    def get_state(self) -> TensorDict:
+        """Snapshot of all that the continuation depends on, save ``generator``: each entry ``(N, ...)``.
+
+        ``reset(state, set_state=True)`` restores it, and the continuation is bit-identical. ``qpos`` and ``qvel`` alone
+        are a state too: the rest is then as at the beginning of an episode.
+        """
+        state = {**self.simulation.state, **self.episode}
+        return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """All that training needs to continue: the snapshot, the generator and the count of faults (``state_dict``)."""
+        return {"snapshot": dict(self.get_state()), "generator": self.generator.get_state(), "faults": self.num_faults}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
+        self._snapshot = TensorDict(state["snapshot"], self.batch_size)
+        self.generator.set_state(state["generator"].cpu())
+        self.num_faults = state["faults"]
+
+    def render(self, index: int = 0, *, width: int = 480, height: int = 480) -> Tensor:
+        """Draw one simulation, shape ``(height, width, 3)``, uint8."""
+        if not 0 <= index < self.num_envs:
+            raise ValueError(f"index={index} names no simulation: pass one of 0..{self.num_envs - 1}")
+        if (width, height) not in self._cameras:
+            self._cameras[width, height] = Camera(self.simulation.model, width=width, height=height)
+        return self._cameras[width, height].picture(self.simulation.data(index), self._arrows(index))
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free what drawing holds."""
+        while self._cameras:
+            self._cameras.popitem()[1].close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _make_specs(self) -> None:
+        """Derive the specs from what is observed; a task calls this at the end of its constructor."""
+        shape, one = self.batch_size, (self.num_envs, 1)
+        low, high = torch.from_numpy(self.simulation.model.actuator_ctrlrange).to(self._dtype).expand(self.num_envs, -1, -1).unbind(-1)
+        observed = {key: Unbounded(value.shape, dtype=self._dtype) for key, value in self._observe().items()}
+        self.observation_spec = Composite(observed, shape=shape)
+        self.action_spec = Bounded(low, high, dtype=self._dtype)
+        self.reward_spec = Unbounded(one, dtype=self._dtype)
+        done = {key: Binary(1, shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        self.full_done_spec = Composite(done, shape=shape)
+
+    def _set_seed(self, seed: int | None) -> None:
+        drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
+        self.generator.manual_seed(drawn)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = tensordict["action"]
+        expected = (self.num_envs, self.simulation.model.nu)
+        if action.shape != expected or action.device.type != "cpu":
+            raise ValueError(
+                f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on the CPU, "
+                "where the physics runs"
+            )
+        faults = self.simulation.step(action)
+        self.episode["elapsed_steps"] += 1
+        reward, terminated = self._judge(faults)
+        if len(faults):
+            reward[faults], terminated[faults] = 0.0, True
+            self.num_faults += len(faults)
+        truncated = self.episode["elapsed_steps"] >= self.max_episode_steps
+        return self._emit(reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any
+    ) -> TensorDict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if self._snapshot is not None and mask is None and not set_state:
+            snapshot, self._snapshot = self._snapshot, None
+            return self._reset(snapshot, set_state=True)
+        ids = torch.arange(self.num_envs) if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
+        state = self._checked(tensordict, ids) if set_state else {}
+        known = {*self.simulation.state, *self.episode}
+        if not known <= state.keys():
+            state = {**self._sample(len(ids)), **state}
+        self.simulation.reset(ids, {key: state[key] for key in self.simulation.state if key in state})
+        state = {"elapsed_steps": torch.zeros(len(ids), 1), **self._begin(ids), **state}
+        for key, memory in self.episode.items():
+            memory[ids] = state[key].to(memory.dtype)
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return self._emit(None, no, no.clone())
+
+    def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:
+        """Rows ``ids`` of the state in ``tensordict``, or an error that says what is wrong with it."""
+        known = {**self.simulation.state, **self.episode}
+        emitted = {"_reset", *self.observation_spec.keys(), *self.done_keys}
+        given = {} if tensordict is None else {k: v for k, v in tensordict.items() if k in known or k not in emitted}
+        if missing := {"qpos", "qvel"} - given.keys():
+            raise ValueError(f"set_state=True without {sorted(missing)}: pass at least qpos and qvel, or get_state()")
+        for key, value in given.items():
+            if key not in known:
+                raise ValueError(f"{key!r} is no part of the state: remove it; the parts are {sorted(known)}")
+            if value.shape != known[key].shape:
+                raise ValueError(f"{key} has shape {tuple(value.shape)}: pass {tuple(known[key].shape)}")
+            if not (value[ids].abs() < LARGEST).all():
+                raise ValueError(f"{key} is not finite, or beyond MuJoCo's limit of {LARGEST:g}: correct it")
+        return {key: value[ids] for key, value in given.items()}
+
+    def _emit(self, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
+        emitted = {key: value.to(self._dtype, copy=True) for key, value in self._observe().items()}
+        emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
+        if reward is not None:
+            emitted["reward"] = reward
+        out = TensorDict(emitted, self.batch_size, device=self.device)
+        return out.pin_memory() if self._pin_memory else out
+
+    @abstractmethod
+    def _sample(self, num: int) -> dict[str, Tensor]:
+        """Draw ``num`` beginnings of an episode from ``generator``: ``qpos``, ``qvel``, and parts of ``episode``."""
+
+    @abstractmethod
+    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
+        """The parts of ``episode`` that follow from the state at its beginning, rows of the simulations ``ids``."""
+
+    @abstractmethod
+    def _observe(self) -> dict[str, Tensor]:
+        """Observation and goal, each ``(N, ...)``."""
+
+    @abstractmethod
+    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+        """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
+
+        Args:
+            faults: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
+        """
+
+    def _arrows(self, index: int) -> list[Arrow]:
+        """What to draw beside the simulation."""
+        return []

@@ -1,0 +1,51 @@
+"""Pictures of a simulation, without a display."""
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+Arrow = tuple[np.ndarray, np.ndarray]
+"""Tail and tip, each ``(3,)``, in metres."""
+
+
+class Camera:
+    """A camera that follows a body and draws into memory.
+
+    Args:
+        model: The model to draw; its off-screen buffer is enlarged where the picture needs it.
+        width: Pixels.
+        height: Pixels.
+        body: The body to follow, 1 for the first below the world.
+        distance: Metres from the camera to the body.
+
+    Raises:
+        RuntimeError: If no OpenGL library for drawing without a display is found.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1, distance: float = 4.0
+    ) -> None:
+        buffer = model.vis.global_
+        buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
+        self.renderer = mujoco.Renderer(model, height, width)
+        self.view = mujoco.MjvCamera()
+        self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        self.view.trackbodyid, self.view.distance = body, distance
+        self.view.azimuth, self.view.elevation = 90.0, -30.0
+
+    def picture(self, data: mujoco.MjData, arrows: list[Arrow]) -> Tensor:
+        """Draw the simulation, shape ``(height, width, 3)``, uint8."""
+        self.renderer.update_scene(data, self.view)
+        scene = self.renderer.scene
+        for tail, tip in arrows:
+            geom = scene.geoms[scene.ngeom]
+            red, arrow = np.array([0.9, 0.1, 0.1, 1.0], np.float32), mujoco.mjtGeom.mjGEOM_ARROW
+            mujoco.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.zeros(9), red)
+            mujoco.mjv_connector(geom, arrow, 0.05, tail, tip)
+            scene.ngeom += 1
+        return torch.from_numpy(self.renderer.render())
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self.renderer.close()

@@ -1,0 +1,166 @@
+"""Many simulations of one MuJoCo model, as torch tensors."""
+
+import copy
+import time
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch, SimulationError
+from torch import Tensor
+
+# The parts of mjSTATE_INTEGRATION, by the names of their MjData fields: all that the next step depends on.
+STATE_FIELDS = (
+    "time",
+    "qpos",
+    "qvel",
+    "act",
+    "history",
+    "qacc_warmstart",
+    "ctrl",
+    "qfrc_applied",
+    "xfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "userdata",
+    "plugin_state",
+)
+
+LARGEST = mujoco.mjMAXVAL
+"""MuJoCo's own limit (1e10): a larger state has diverged."""
+
+
+class Simulation:
+    """A batch of N simulations stepped by MuJoCo's thread pool, with faults contained.
+
+    A simulation *faults* in a step when MuJoCo raises an error in it, when its state leaves the finite numbers below
+    ``LARGEST``, or when its controls do. It then keeps the state it had before the step, and its neighbours do not
+    notice. MuJoCo's own answer to a divergence, a silent reset in the middle of a step, is switched off.
+
+    Args:
+        model: The compiled model; a copy is kept.
+        num_envs: Number N of simulations.
+        substeps: Physics steps per call of :meth:`step`.
+        num_threads: Threads; 0 takes one per processor. Results do not depend on it.
+        outputs: The other ``MjData`` fields to expose. After :meth:`step` they are one substep behind the state, as after
+            ``mj_step``; after :meth:`reset` they are current.
+        persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        *,
+        substeps: int,
+        outputs: Sequence[str] = (),
+        num_threads: int = 0,
+        persistent: bool = False,
+    ) -> None:
+        self.model = copy.copy(model)
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.substeps = substeps
+        self.physics_seconds = 0.0
+        """Wall-clock seconds spent inside MuJoCo so far."""
+        self._batch = Batch(self.model, num_envs, num_threads, persistent)
+        self._data = mujoco.MjData(self.model)
+        self._rows = self._batch.state
+        self._initial, self._before = self._rows[0].copy(), np.empty_like(self._rows)
+        fields = {name: self._batch.bind(name) for name in STATE_FIELDS}
+        self._fields = {name: field for name, field in fields.items() if field.size}
+        self.state = {name: torch.from_numpy(field) for name, field in self._fields.items()}
+        """Live views of the state fields that the model has, each ``(N, ...)``, float64. Writing sets the state."""
+        self.outputs = {name: _view(self._batch.bind(name)) for name in outputs}
+        """Live views of the outputs, each ``(N, ...)``: results of the last call, not to be written to."""
+
+    def step(self, ctrl: Tensor) -> Tensor:
+        """Advance every simulation by ``substeps`` physics steps.
+
+        Args:
+            ctrl: Controls, shape ``(N, A)``.
+
+        Returns:
+            The simulations that faulted, shape ``(n,)``, int64; usually none.
+        """
+        np.copyto(self._before, self._rows)
+        controls = ctrl.numpy()
+        np.copyto(self._fields["ctrl"], controls)
+        start, failed = time.perf_counter(), []
+        try:
+            self._batch.step(nstep=self.substeps)
+        except SimulationError as error:
+            failed = error.ids
+        self.physics_seconds += time.perf_counter() - start
+        if not len(failed) and _bounded(controls) and _bounded(self._rows):
+            return _NONE
+        faults = ~(_bounded(controls, -1) & _bounded(self._rows, -1))
+        faults[failed] = True
+        ids = faults.nonzero()[0]
+        self._rows[ids] = self._before[ids]
+        self._forward(ids)
+        self._rows[ids] = self._before[ids]
+        return torch.from_numpy(ids)
+
+    def reset(self, ids: Tensor, fields: Mapping[str, Tensor]) -> None:
+        """Set the state of some simulations and bring their outputs up to date.
+
+        Args:
+            ids: The n simulations, shape ``(n,)``, int64.
+            fields: Values of state fields, each ``(n, ...)``; the other fields take the model's defaults.
+        """
+        rows = ids.numpy()
+        self._rows[rows] = self._initial
+        for name, value in fields.items():
+            self._fields[name][rows] = value.numpy()
+        self._forward(rows)
+        if "qacc_warmstart" in fields:  # mj_forward replaced it
+            self._fields["qacc_warmstart"][rows] = fields["qacc_warmstart"].numpy()
+
+    def contact_forces(self, ids: Tensor) -> Tensor:
+        """External contact forces on every body, MuJoCo's ``cfrc_ext``, at the time of the outputs.
+
+        ``mj_step`` leaves them to ``mj_rnePostConstraint``, which ``Batch`` cannot call: each simulation's ``MjData`` is
+        copied out to Python, about 20 microseconds a piece on one thread.
+
+        Args:
+            ids: The n simulations, shape ``(n,)``, int64.
+
+        Returns:
+            Torques and forces about the centre of mass, shape ``(n, bodies, 6)``, in N m and N.
+        """
+        forces = torch.empty(len(ids), self.model.nbody, 6, dtype=torch.float64)
+        start = time.perf_counter()
+        for row, index in enumerate(ids.tolist()):
+            self._batch.get_data(index, self._data)
+            mujoco.mj_rnePostConstraint(self.model, self._data)
+            forces[row] = torch.from_numpy(self._data.cfrc_ext)
+        self.physics_seconds += time.perf_counter() - start
+        return forces
+
+    def data(self, index: int) -> mujoco.MjData:
+        """One simulation as an ``MjData`` with everything computed, to draw it or to look into it."""
+        self._batch.get_data(index, self._data)
+        mujoco.mj_forward(self.model, self._data)
+        return self._data
+
+    def _forward(self, ids: np.ndarray) -> None:
+        start = time.perf_counter()
+        self._batch.forward(ids)
+        self.physics_seconds += time.perf_counter() - start
+
+
+_NONE = torch.empty(0, dtype=torch.int64)
+
+
+def _bounded(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Whether all values are numbers of a size below ``LARGEST``: a NaN compares false."""
+    return (values.max(axis) < LARGEST) & (values.min(axis) > -LARGEST)
+
+
+def _view(array: np.ndarray) -> Tensor:
+    """An output as a tensor. They are read-only, which torch knows not of and warns about."""
+    array = array.view()
+    array.flags.writeable = True
+    return torch.from_numpy(array)

@@ -1,0 +1,9 @@
+import subprocess
+import sys
+
+
+def test_the_distributions_need_torch_alone():
+    code = "import sys, torchrl_mcp.distributions; print([m for m in sys.argv[1:] if m in sys.modules])"
+    heavy = ["torchrl", "tensordict", "mujoco", "hydra", "gymnasium"]
+    run = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"

@@ -1,0 +1,25 @@
+"""The paper's figures, from run folders and policies: functions of data, which never touch matplotlib's global state."""
+
+from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.analysis.holdout import (
+    Trajectories,
+    draw_trajectories,
+    load_trajectories,
+    play_directions,
+    save_trajectories,
+)
+
+__all__ = [
+    "Curve",
+    "Trajectories",
+    "draw_curves",
+    "draw_trajectories",
+    "learning_curves",
+    "load_trajectories",
+    "play_directions",
+    "read_metrics",
+    "save_figure",
+    "save_trajectories",
+    "write_curves",
+]

@@ -1,0 +1,141 @@
+"""Learning curves over several seeds, as in Figures 4 and 5 (left), from the metrics of run folders."""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from numpy.typing import NDArray
+
+from torchrl_mcp.analysis.figures import COLOURS, bare, new_figure
+
+Array = NDArray[np.float64]
+
+QUANTITY = "episode/normalised_return"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A quantity against environment steps, over the seeds of one method.
+
+    Attributes:
+        label: Name of the method.
+        frames: Environment steps, ``(T,)``.
+        mean: Mean over seeds, ``(T,)``.
+        low: Least of the seeds, ``(T,)``.
+        high: Greatest of the seeds, ``(T,)``.
+        seeds: Number of seeds.
+    """
+
+    label: str
+    frames: Array
+    mean: Array
+    low: Array
+    high: Array
+    seeds: int
+
+
+def read_metrics(run: Path) -> list[dict[str, float]]:
+    """Return the rows of a run's ``metrics.csv``; blank is NaN, and a row half written is left out."""
+    path = run / "metrics.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [
+            {name: float(value or "nan") for name, value in row.items()}
+            for row in csv.DictReader(file)
+            if None not in row.values()
+        ]
+
+
+def learning_curves(
+    groups: Mapping[str, Sequence[Path]], *, quantity: str = QUANTITY, num_bins: int = 50
+) -> list[Curve]:
+    """Return one curve per group on a common grid of steps, for what every seed of the group has reached.
+
+    Steps are divided into ``num_bins`` equal bins up to the end of the longest run. A bin holds the mean of a run's rows,
+    weighted by ``episode/count`` where the quantity is a mean over episodes. Bins without an episode in them are
+    interpolated. Bins should be no shorter than an episode in all environments: in shorter ones the episodes that fail
+    early can be among themselves.
+
+    Args:
+        groups: Run folders, one per seed, by the label of their curve.
+        quantity: A column of ``metrics.csv``.
+        num_bins: Number of bins.
+
+    Raises:
+        ValueError: If a run has no such column, or a group no run.
+    """
+    runs = {label: [_points(Path(folder), quantity) for folder in folders] for label, folders in groups.items()}
+    if empty := [label for label, points in runs.items() if not points]:
+        raise ValueError(f"groups {empty} name no run folder: leave them out or list their runs")
+    longest = max(points[0].max() for group in runs.values() for points in group)
+    edges = np.linspace(0.0, longest, num_bins + 1)
+    return [_curve(label, [_binned(*points, edges) for points in group], edges) for label, group in runs.items()]
+
+
+def write_curves(curves: Sequence[Curve], path: Path) -> None:
+    """Write curves as CSV: one row per label and bin, with ``frames``, ``mean``, ``low``, ``high`` and ``seeds``."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["label", "frames", "mean", "low", "high", "seeds"])
+        for curve in curves:
+            for row in zip(curve.frames, curve.mean, curve.low, curve.high, strict=True):
+                writer.writerow([curve.label, *map(float, row), curve.seeds])
+
+
+def draw_curves(
+    curves: Sequence[Curve], *, xlabel: str = "environment steps", ylabel: str = "normalised return"
+) -> Figure:
+    """Draw curves as lines, each with the range of its seeds as a band around it."""
+    figure = new_figure(6.4, 3.6)
+    axes = figure.add_subplot()
+    for curve, colour in zip(curves, COLOURS, strict=False):
+        axes.fill_between(curve.frames, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(curve.frames, curve.mean, color=colour, linewidth=2, label=_legend(curve), solid_capstyle="round")
+    axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(axis="y", color="#EEEEEE")
+    axes.set_axisbelow(True)
+    bare(axes)
+    figure.legend(loc="outside upper center", ncols=min(len(curves), 3), frameon=False, fontsize=9)
+    return figure
+
+
+def _legend(curve: Curve) -> str:
+    return f"{curve.label} ({curve.seeds} seeds: mean, range)" if curve.seeds > 1 else curve.label
+
+
+def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
+    """Steps, values and weights of the rows that have the quantity, each ``(R,)``."""
+    rows = read_metrics(run)
+    if not rows or quantity not in rows[0]:
+        raise ValueError(f"{run} has no {quantity!r} in metrics.csv: the columns are {sorted(rows[0]) if rows else []}")
+    weight = "episode/count" if quantity.startswith("episode/") else None
+    points = [(row["frames"], row[quantity], row[weight] if weight else 1.0) for row in rows]
+    points = [point for point in points if math.isfinite(point[1])]
+    if not points:
+        raise ValueError(f"{run} has no finite {quantity!r} yet: let it run until episodes have ended")
+    frames, values, weights = np.array(points).T
+    return frames, values, weights
+
+
+def _binned(frames: Array, values: Array, weights: Array, edges: Array) -> Array:
+    """Weighted means in the bins ``(edges[i], edges[i + 1]]``; NaN before the first and after the last point."""
+    index = np.searchsorted(edges, frames, side="left").clip(1, len(edges) - 1) - 1
+    total, mass = (np.bincount(index, x, minlength=len(edges) - 1) for x in (weights * values, weights))
+    bins = np.arange(len(edges) - 1)
+    full = mass > 0
+    return np.interp(bins, bins[full], total[full] / mass[full], left=np.nan, right=np.nan)
+
+
+def _curve(label: str, seeds: Sequence[Array], edges: Array) -> Curve:
+    stacked = np.stack(seeds)
+    known = np.isfinite(stacked).all(0)
+    middle = (edges[1:] + edges[:-1])[known] / 2
+    values = stacked[:, known]
+    return Curve(label, middle, values.mean(0), values.min(0), values.max(0), len(seeds))

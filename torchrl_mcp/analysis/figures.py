@@ -1,0 +1,47 @@
+"""What all figures share: a plain look, colours that colour-blind readers can tell apart, and the files."""
+
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+# Okabe and Ito, "Color Universal Design", 2008, https://jfly.uni-koeln.de/color/, darkest contrasts first.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+
+# A cycle for angles: orange opposes blue and dark opposes light, which every kind of colour vision keeps apart. Unlike
+# matplotlib's own, no part of it is too light for lines on white.
+DIRECTIONS = LinearSegmentedColormap.from_list(
+    "directions", ["#E69F00", "#B8400E", "#40203C", "#123F7D", "#0E7FC2", "#63B9DE", "#A9B58C", "#E69F00"]
+)
+
+INK = "#333333"
+FAINT = "#DDDDDD"
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, drawn by Agg whatever the machine's display."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def bare(axes: Axes) -> None:
+    """Leave of the frame of ``axes`` what carries numbers: faint lines left and below."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+    axes.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)
+
+
+def save_figure(figure: Figure, stem: Path) -> tuple[Path, Path]:
+    """Write ``figure`` as ``<stem>.png`` (200 dots per inch) and ``<stem>.svg``, the same bytes for the same data."""
+    png, svg = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.svg")
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(png, dpi=200)
+    with rc_context({"svg.hashsalt": stem.name}):
+        figure.savefig(svg, metadata={"Date": None})
+    return png, svg

@@ -1,0 +1,118 @@
+"""Where a character goes that is told where to go: trajectories by target direction, as in Figure 5 (right)."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_mcp.analysis.figures import DIRECTIONS, FAINT, INK, new_figure
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.evaluation import evaluate
+
+QUARTERS = {"0": 0.0, "π/2": math.pi / 2, "π": math.pi, "3π/2": 1.5 * math.pi}
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Episodes with the directions they were told to take.
+
+    Attributes:
+        directions: Target directions in radians, counted from +x towards +y, ``(N,)``.
+        positions: Horizontal position of the root, ``(T, N, 2)`` in metres; NaN from an episode's end on.
+    """
+
+    directions: NDArray[np.float64]
+    positions: NDArray[np.float64]
+
+
+def play_directions(
+    policy: TensorDictModuleBase, env: CharacterEnv, directions: Tensor, *, deterministic: bool = True
+) -> Trajectories:
+    """Play one episode per direction, whatever directions the environment draws by itself.
+
+    Args:
+        policy: From ``observation`` and ``goal`` to ``action``.
+        env: Environments whose ``goal`` is the (cos, sin) of a direction, batch size ``[N]``.
+        directions: Target directions in radians, ``(N,)``.
+        deterministic: Play the deterministic action rather than a sample.
+
+    Raises:
+        ValueError: If there is not one direction per environment.
+    """
+    if directions.shape != env.batch_size:
+        raise ValueError(f"directions has shape {tuple(directions.shape)}: pass one per environment, {env.batch_size}")
+    env.reset()
+    start = env.get_state()
+    start["goal"] = torch.stack([directions.cos(), directions.sin()], -1).to(start["goal"].dtype)
+    outcome = evaluate(policy, env, deterministic=deterministic, start=start)
+    return Trajectories(directions.numpy().astype(np.float64), outcome.positions.numpy())
+
+
+def save_trajectories(trajectories: Trajectories, path: Path) -> None:
+    """Write trajectories as a NumPy archive of ``directions`` and ``positions``."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, directions=trajectories.directions, positions=trajectories.positions)
+
+
+def load_trajectories(path: Path) -> Trajectories:
+    """Read what :func:`save_trajectories` wrote."""
+    with np.load(path) as archive:
+        return Trajectories(archive["directions"], archive["positions"])
+
+
+def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
+    """Draw trajectories, each panel under its title, all on one scale in metres.
+
+    A path has the colour of its target direction, which the mark of that colour on the outer ring shows: perfect paths
+    are rays towards their marks.
+    """
+    positions = [trajectories.positions[np.isfinite(trajectories.positions)] for trajectories in panels.values()]
+    rings = _rings(max((float(np.abs(p).max(initial=0.0)) for p in positions), default=0.0))
+    figure = new_figure(3.3 * len(panels), 3.75)
+    for column, (title, trajectories) in enumerate(panels.items(), start=1):
+        axes = figure.add_subplot(1, len(panels), column)
+        _draw_compass(axes, rings)
+        _draw_paths(axes, trajectories, 1.06 * rings[-1])
+        axes.set_title(title, fontsize=10, color=INK)
+    return figure
+
+
+def _rings(reach: float) -> Sequence[float]:
+    """Round distances in metres, the last of which is at least ``reach``."""
+    ticks = MaxNLocator(nbins=3, steps=[1, 2, 4, 5, 10]).tick_values(0.0, max(reach, 1e-3))
+    return [float(tick) for tick in ticks if tick > 0]
+
+
+def _draw_compass(axes: Axes, rings: Sequence[float]) -> None:
+    """Rings of equal distance, and angles around the outermost."""
+    angle = np.linspace(0.0, 2 * math.pi, 361)
+    for radius in rings:
+        axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=FAINT, linewidth=0.8, zorder=0)
+        axes.annotate(
+            f"{radius:g} m", (0.0, radius), ha="center", va="center", fontsize=7, color="#777777",
+            bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"},
+        )  # fmt: skip
+    for label, at in QUARTERS.items():
+        radius = 1.2 * rings[-1]
+        axes.annotate(label, (radius * math.cos(at), radius * math.sin(at)), ha="center", va="center", color=INK)
+    limit = 1.3 * rings[-1]
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    axes.axis("off")
+
+
+def _draw_paths(axes: Axes, trajectories: Trajectories, rim: float) -> None:
+    colours = DIRECTIONS(trajectories.directions / (2 * math.pi) % 1.0)
+    for path, colour in zip(trajectories.positions.swapaxes(0, 1), colours, strict=True):
+        axes.plot(*path.T, color=colour, linewidth=1.0, alpha=0.85, solid_capstyle="round")
+    axes.scatter(
+        rim * np.cos(trajectories.directions), rim * np.sin(trajectories.directions), s=26, c=colours, linewidths=0
+    )

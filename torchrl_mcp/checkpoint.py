@@ -1,0 +1,94 @@
+"""Checkpoints: one archive per save, written atomically, checked on loading, and free of pickled code.
+
+They are TorchRL's own :class:`torchrl.checkpoint.Checkpoint` archives: a ZIP file with a checksum per tensor and a JSON
+manifest that holds the run's configuration and the library versions. Every part of an agent is a component of its
+own, so that transfer loads the ones it keeps.
+"""
+
+import zlib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+from torch import nn
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+
+FOLDER = "checkpoints"
+
+# What torchrl, tensordict, zipfile and json raise when a file is damaged or of another kind.
+UNREADABLE = (AttributeError, BadZipFile, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zlib.error)
+
+
+def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:  # noqa: ANN401
+    """Return the checkpoint of a run: its ``parts``, each under its name, and further ``components`` with state."""
+    return Checkpoint(format="archive", **{_component(name): part for name, part in parts.items()}, **components)
+
+
+def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None = None) -> None:
+    """Restore ``components`` of ``checkpoint``, or all, from the file ``path``.
+
+    Raises:
+        ValueError: If the file is missing, truncated, damaged, of another kind, or does not fit.
+    """
+    if not path.is_file():
+        raise ValueError(f"there is no checkpoint file {path}")
+    try:
+        _require_plain_data(path)
+        checkpoint.load(path, components=components, map_location="cpu")
+    except UNREADABLE as error:
+        raise ValueError(
+            f"cannot restore {path}: {error}. The file is damaged or belongs to a different method, character, task or "
+            "network size; give a checkpoint of the same configuration"
+        ) from error
+
+
+def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None:
+    """Restore the parts ``names`` alone from the checkpoint file ``path``.
+
+    Raises:
+        ValueError: As :func:`load`.
+    """
+    load(run_checkpoint(nn.ModuleDict({name: parts[name] for name in names})), path)
+
+
+def rotation(run: Path, keep_last: int) -> CheckpointRotation:
+    """Return the checkpoints of a run folder, of which the newest ``keep_last`` stay."""
+    return CheckpointRotation(run / FOLDER, keep_last=keep_last)
+
+
+def find(path: Path) -> Path:
+    """Return ``path`` if it is a file, or the newest checkpoint of the run folder ``path``.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if path.is_file():
+        return path
+    if path.is_dir() and (latest := rotation(path, keep_last=1).latest()) is not None:
+        return latest
+    raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
+
+
+def configuration(path: Path) -> Mapping[str, Any]:
+    """Return the configuration of the run that wrote the checkpoint file ``path``.
+
+    Raises:
+        ValueError: If the file is not a checkpoint of this library.
+    """
+    try:
+        return Checkpoint.manifest(path)["metadata"]["config"]
+    except UNREADABLE as error:
+        raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: {error}") from error
+
+
+def _require_plain_data(path: Path) -> None:
+    """Refuse an archive with anything but JSON and tensors: tensordict would unpickle it, which can run any code."""
+    with ZipFile(path) as archive:
+        for name in archive.namelist():
+            if not name.endswith((".json", ".memmap")):
+                raise CheckpointError(f"it holds {name}, which is neither JSON nor a tensor")
+
+
+def _component(part: str) -> str:
+    return f"part-{part}"

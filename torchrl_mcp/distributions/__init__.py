@@ -1,0 +1,6 @@
+"""Action distributions composed of K Gaussian primitives; they need torch and nothing else."""
+
+from torchrl_mcp.distributions.additive import AdditiveGaussian
+from torchrl_mcp.distributions.multiplicative import MultiplicativeGaussian
+
+__all__ = ["AdditiveGaussian", "MultiplicativeGaussian"]

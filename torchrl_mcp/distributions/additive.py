@@ -1,0 +1,114 @@
+"""The additive composition of Gaussian primitives (Eq. 1): a mixture of experts."""
+
+import math
+from typing import Self
+
+import torch
+from torch import Size, Tensor
+from torch.distributions import Categorical, Distribution, Independent, MixtureSameFamily, Normal
+
+from torchrl_mcp.distributions.multiplicative import broadcast_primitives
+
+# Normalising multiplies the gradient by 1 / sum(w), on top of log-densities that reach 1e17 when narrow primitives meet
+# wide ones: the product must stay in float32. Softmax and all but dead sigmoid gates are far above.
+GATES_FLOOR = 1e-8
+
+
+class AdditiveGaussian(MixtureSameFamily):
+    r"""Mixture of :math:`K` diagonal Gaussians: a primitive is drawn, then an action from it.
+
+    .. math:: \pi(a) = \sum_{k=1}^K \bar w_k \, \mathcal{N}(a; \mu_k, \sigma_k^2), \qquad
+        \bar w_k = \frac{w_k}{\sum_{j=1}^K w_j}
+
+    The sum of the gates is never taken below ``1e-8``; where it would be, equal gates make up the difference, so that
+    without validation all gates closed are a mixture in equal parts and not a division by zero. Arguments of half
+    precision are promoted to ``float32``, and so are the samples.
+
+    Args:
+        loc: Primitive means, shape ``(*B, K, A)``.
+        scale: Primitive standard deviations, shape ``(*B, K, A)``, positive; the paper writes its
+            variance as :math:`\sigma`, without the square.
+        gates: Weights, shape ``(*B, K)``, non-negative and not all zero; they are normalised to sum to one.
+        validate_args: Whether to check the arguments; ``None`` follows torch's default, which importing TorchRL
+            switches off.
+
+    Raises:
+        ValueError: If validation is on and the shapes do not broadcast, ``loc`` is not finite, ``scale`` is not
+            positive and finite, or ``gates`` are negative, not finite or all zero.
+
+    Reference:
+        Peng et al., "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies",
+        NeurIPS 2019, https://arxiv.org/abs/1905.09808, Eq. 1.
+
+    Example:
+        >>> loc, scale = torch.tensor([[0.0], [4.0]]), torch.ones(2, 1)
+        >>> policy = AdditiveGaussian(loc, scale, gates=torch.tensor([3.0, 1.0]))
+        >>> policy.mean, policy.variance, policy.deterministic_sample
+        (tensor([1.]), tensor([4.]), tensor([0.]))
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor, gates: Tensor, validate_args: bool | None = None) -> None:
+        loc, scale, gates = broadcast_primitives(loc, scale, gates, validate_args)
+        total = gates.sum(-1, keepdim=True)
+        gates = gates + (GATES_FLOOR - total).clamp_min(0) / gates.shape[-1]
+        super().__init__(
+            Categorical(probs=gates, validate_args=validate_args),
+            Independent(Normal(loc, scale, validate_args), 1, validate_args),
+            validate_args,
+        )
+        if self._validate_args and not torch._is_all_true(total > 0):
+            raise ValueError(
+                f"gates of shape {tuple(gates.shape)} hold a row of zeros, must leave one primitive open; "
+                "end the gate in a softmax."
+            )
+
+    def expand(self, batch_shape: Size | list[int] | tuple[int, ...], _instance: Distribution | None = None) -> Self:
+        """Return the same distribution over a larger batch, without copying."""
+        return super().expand(batch_shape, self._get_checked_instance(AdditiveGaussian, _instance))
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        r"""Return :math:`\log \sum_k \bar w_k \mathcal{N}(a; \mu_k, \sigma_k^2)`.
+
+        Args:
+            value: Actions, shape ``(*S, *B, A)``.
+
+        Returns:
+            Log-densities, shape ``(*S, *B)``.
+        """
+        if self._validate_args:
+            self._validate_sample(value)
+        log_probs = self.component_distribution.log_prob(value.unsqueeze(-2))
+        gates = self.mixture_distribution.probs
+        info = torch.finfo(gates.dtype)
+        # Not inherited, because torch raises every weight to 1e-7: a closed primitive would then own the tails, and
+        # get no gradient. Around this anchor, which cancels, an open primitive adds at most 1 to the sum.
+        anchor = (gates.log() + log_probs).amax(-1, keepdim=True).detach()
+        excess = log_probs - anchor
+        # A closed one adds nothing however likely it makes the action; only its slope needs a bound.
+        excess = torch.where(gates < info.tiny, excess.clamp_max(-math.log(info.eps)), excess)
+        return anchor.squeeze(-1) + (gates * excess.exp()).sum(-1).log()
+
+    def entropy(self, num_samples: int = 1) -> Tensor:
+        r"""Estimate the entropy without bias in its value or its gradient.
+
+        .. math:: H = -\sum_{k=1}^K \bar w_k \,
+            \mathbb{E}_{\epsilon \sim \mathcal{N}(0, I)} \left[ \log \pi(\mu_k + \sigma_k \epsilon) \right]
+
+        The sum over primitives is exact and the expectation is reparametrised. An estimate from samples of the
+        mixture, which TorchRL falls back on otherwise, has the same value but a gradient of zero on average.
+
+        Args:
+            num_samples: Noise samples per primitive.
+
+        Returns:
+            Entropy estimates, shape ``(*B,)``.
+        """
+        actions = self.component_distribution.rsample((num_samples,)).movedim(-2, 0)
+        gates = self.mixture_distribution.probs.movedim(-1, 0).unsqueeze(1)
+        return -(gates * self.log_prob(actions)).sum(0).mean(0)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The mean of the most likely primitive, shape ``(*B, A)``; between two modes the mixture's own is poor."""
+        index = self.mixture_distribution.probs.argmax(-1)[..., None, None]
+        return torch.take_along_dim(self.component_distribution.mean, index, dim=-2).squeeze(-2)

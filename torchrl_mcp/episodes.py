@@ -1,0 +1,38 @@
+"""Returns and lengths of the episodes that end while training."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+
+class EpisodeStatistics:
+    """Sums rewards over episodes that span several batches.
+
+    Args:
+        num_envs: Number of environments, ``N``.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.returns = torch.zeros(num_envs)
+        self.lengths = torch.zeros(num_envs)
+
+    def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Add trajectories ``(N, T)``; give return and length of each of the ``E`` episodes that ended, ``(E,)``."""
+        ended_returns, ended_lengths = [], []
+        rewards, dones = batch["next", "reward"].squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
+        for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
+            self.returns += reward
+            self.lengths += 1
+            ended_returns.append(self.returns[done])
+            ended_lengths.append(self.lengths[done])
+            self.returns[done] = 0
+            self.lengths[done] = 0
+        return torch.cat(ended_returns), torch.cat(ended_lengths)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the sums of the episodes under way."""
+        return {"returns": self.returns, "lengths": self.lengths}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.returns, self.lengths = state["returns"].clone(), state["lengths"].clone()

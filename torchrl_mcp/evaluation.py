@@ -1,0 +1,94 @@
+"""How good is a policy? One episode in each of many environments."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes, one per environment.
+
+    Attributes:
+        returns: Undiscounted sum of rewards of each episode, ``(N,)``.
+        lengths: Control steps of each episode, ``(N,)``.
+        terminated: Whether the episode ended before its time limit, ``(N,)``.
+        positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN from an episode's end on.
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    terminated: Tensor
+    positions: Tensor
+
+
+@torch.no_grad()
+def evaluate(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    *,
+    deterministic: bool = True,
+    start: TensorDictBase | None = None,
+    device: torch.device | str = "cpu",
+) -> Evaluation:
+    """Play one episode in each environment of a batch, to its end.
+
+    Counting the first episodes to finish instead would favour short ones.
+
+    Args:
+        policy: From ``observation`` and ``goal`` to ``action``.
+        env: Environments with batch size ``[N]`` whose episodes all end.
+        deterministic: Play the deterministic action rather than a sample.
+        start: State to begin from, as of ``env.get_state()``, or None to draw it.
+        device: Where the policy is.
+    """
+    exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    state = env.reset() if start is None else env.reset(start, set_state=True)
+    running = torch.ones(env.batch_size, dtype=torch.bool)
+    returns = torch.zeros(env.batch_size)
+    lengths = torch.zeros(env.batch_size, dtype=torch.int64)
+    terminated = torch.zeros_like(running)
+    positions = []
+    with set_exploration_type(exploration):
+        while running.any():
+            action = policy(state.select("observation", "goal").to(device))["action"]
+            step, state = env.step_and_maybe_reset(state.set("action", action.to(env.device)))
+            outcome = step["next"]
+            returns += outcome["reward"].squeeze(-1) * running
+            lengths += running
+            terminated |= running & outcome["terminated"].squeeze(-1)
+            running &= ~outcome["done"].squeeze(-1)
+            positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
+    return Evaluation(returns, lengths, terminated, torch.stack(positions))
+
+
+def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:
+    """Condense episodes into numbers.
+
+    Args:
+        outcome: The episodes.
+        normalised_return: The task's normalisation of returns.
+        resamples: Bootstrap resamples of the episodes behind ``interval``.
+
+    Returns:
+        Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
+        fraction), the standard deviation over episodes, and a 95 % percentile bootstrap interval of the mean.
+    """
+    normalised = normalised_return(outcome.returns)
+    generator = torch.Generator().manual_seed(0)
+    index = torch.randint(len(normalised), (resamples, len(normalised)), generator=generator)
+    low, high = normalised[index].mean(1).quantile(torch.tensor([0.025, 0.975])).tolist()
+    return {
+        "normalised_return": normalised.mean().item(),
+        "normalised_return_std": normalised.std().item(),
+        "interval": [low, high],
+        "return": outcome.returns.mean().item(),
+        "length": outcome.lengths.float().mean().item(),
+        "terminated": outcome.terminated.float().mean().item(),
+        "episodes": len(normalised),
+    }

@@ -1,0 +1,171 @@
+"""From a configuration to objects. Beside the entry points, the only module that knows Hydra."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.record.loggers.common import Logger
+
+from torchrl_mcp import checkpoint
+from torchrl_mcp.actors import Actor
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.record import Record
+from torchrl_mcp.training import Trainer
+from torchrl_mcp.transfer import FrozenParts, require_parts
+
+CONFIG = "config.yaml"
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A method's networks for the sizes of an environment."""
+
+    parts: nn.ModuleDict
+    actor: Actor
+    critic: TensorDictModuleBase
+    frozen: FrozenParts
+
+
+def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv:  # noqa: ANN401
+    """Return the environments of the configured task and stage."""
+    return instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
+
+
+def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
+    """Return the agent of the configured method, its kept parts from the checkpoint file ``pretrained`` if given."""
+    sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
+    parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
+    names: Sequence[str] = ()
+    if cfg.stage.name == "transfer":
+        require_parts(parts, cfg.transfer.keep, "transfer.keep")
+        if pretrained is not None and cfg.transfer.keep:
+            checkpoint.load_parts(parts, cfg.transfer.keep, pretrained)
+        names = cfg.transfer.freeze
+    frozen = FrozenParts(parts, names)
+    actor = instantiate(cfg.actor)(parts, frozen=names)
+    critic = instantiate(cfg.critic)(parts, sizes["observation"], sizes["goal"])
+    parts.to(cfg.device)
+    return Agent(parts, actor, critic, frozen)
+
+
+def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv, folder: Path) -> Trainer:
+    """Return the trainer of an agent."""
+    trainable = {
+        "actor": [p for p in agent.actor.trained.parameters() if p.requires_grad],
+        "critic": list(agent.parts["critic"].parameters()),
+    }
+    optimizers = {f"{name}_optimizer": instantiate(cfg.optimizer[name])(p) for name, p in trainable.items()}
+    loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
+    loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob, value="state_value")
+    training = OmegaConf.to_container(cfg.training)
+    del training["num_envs"]
+    return Trainer(
+        env=env,
+        parts=agent.parts,
+        actor=agent.actor,
+        critic=agent.critic,
+        loss=loss,
+        advantages=instantiate(cfg.objective.advantages)(agent.critic),
+        **optimizers,
+        frozen=agent.frozen,
+        record=Record(folder),
+        checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
+        config=OmegaConf.to_container(cfg, resolve=True),
+        max_grad_norm=cfg.objective.max_grad_norm,
+        step_size_schedule=instantiate(cfg.optimizer.schedule),
+        autocast=cfg.autocast,
+        device=cfg.device,
+        checkpoint_interval=cfg.checkpoint_interval,
+        progress_bar=cfg.progress_bar,
+        **training,
+    )
+
+
+def train(cfg: DictConfig) -> Path:
+    """Train from the start in the run folder ``cfg.run_dir``, and return it.
+
+    Raises:
+        ValueError: If the folder holds a run already, or the configuration lacks the checkpoint to transfer from.
+    """
+    folder = Path(cfg.run_dir)
+    if (folder / CONFIG).exists():
+        raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    trainer = _trainer(cfg, folder, _pretrained(cfg))
+    folder.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    trainer.record.loggers = _loggers(cfg)
+    trainer.save()
+    trainer.run()
+    return folder
+
+
+def resume(folder: Path) -> Path:
+    """Continue the run in ``folder`` from its newest checkpoint, with the configuration it began with.
+
+    Raises:
+        ValueError: If the folder holds no run, or its checkpoint is damaged.
+    """
+    if not (folder / CONFIG).is_file():
+        raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
+    cfg = OmegaConf.load(folder / CONFIG)
+    trainer = _trainer(cfg, folder)
+    trainer.restore(checkpoint.find(folder))
+    trainer.record.loggers = _loggers(cfg)
+    trainer.run()
+    return folder
+
+
+def restore(
+    path: Path, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
+) -> tuple[DictConfig, Agent, CharacterEnv]:
+    """Return configuration, trained agent and fresh environments from a run folder or checkpoint file.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        num_envs: Number of environments.
+        seed: Their seed.
+        device: Where to put the networks.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    file = checkpoint.find(path)
+    cfg = OmegaConf.create(dict(checkpoint.configuration(file)))
+    cfg.device = device
+    env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
+    agent = make_agent(cfg, env)
+    checkpoint.load_parts(agent.parts, list(agent.parts), file)
+    return cfg, agent, env
+
+
+def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> Trainer:
+    if cfg.torch_threads:
+        torch.set_num_threads(cfg.torch_threads)
+    torch.manual_seed(cfg.seed)
+    on_gpu = torch.device(cfg.device).type == "cuda"
+    env = make_env(cfg, num_envs=cfg.training.num_envs, seed=cfg.seed, pin_memory=on_gpu)
+    agent = make_agent(cfg, env, pretrained)
+    return make_trainer(cfg, agent, env, folder)
+
+
+def _loggers(cfg: DictConfig) -> list[Logger]:
+    return [instantiate(cfg.logger)] if cfg.logger else []
+
+
+def _pretrained(cfg: DictConfig) -> Path | None:
+    """Return the checkpoint file to transfer from, or None where nothing is transferred."""
+    if cfg.stage.name != "transfer" or not cfg.transfer.keep:
+        return None
+    if cfg.checkpoint is None:
+        raise ValueError(
+            f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
+            "give its run folder as checkpoint=<folder>"
+        )
+    return checkpoint.find(Path(cfg.checkpoint))

@@ -1,0 +1,90 @@
+"""The gating network of Figure 3 and what its weights say."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+
+class Gating(nn.Module):
+    r"""Gate logits from state and goal: the left half of Figure 3, up to the output activation.
+
+    State and goal are encoded by separate networks whose features are concatenated and processed by one more layer.
+    The activation that turns logits into weights, a sigmoid in the paper, is a module of its own, since exploration
+    over weights samples the logits before it.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        num_primitives: Number of logits, ``K``.
+        state_cells: Hidden units of the state encoder.
+        goal_cells: Hidden units of the goal encoder.
+        joint_cells: Hidden units after the concatenation.
+        output_gain: Factor on the initial weights of the output layer; small values start all gates alike.
+
+    Reference:
+        Peng et al., *MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies*,
+        NeurIPS 2019, Figure 3. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        goal_dim: int,
+        num_primitives: int,
+        *,
+        state_cells: Sequence[int] = (512, 256),
+        goal_cells: Sequence[int] = (512, 256),
+        joint_cells: Sequence[int] = (256,),
+        output_gain: float = 0.01,
+    ) -> None:
+        super().__init__()
+        self.state_encoder = relu_mlp(observation_dim, state_cells)
+        self.goal_encoder = relu_mlp(goal_dim, goal_cells)
+        self.joint = relu_mlp(state_cells[-1] + goal_cells[-1], joint_cells)
+        self.output = scaled_linear(joint_cells[-1], num_primitives, output_gain)
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
+        features = torch.cat([self.state_encoder(observation), self.goal_encoder(goal)], dim=-1)
+        return self.output(self.joint(features))
+
+
+def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:
+    """Return fully connected layers, each followed by a ReLU (Figure 3)."""
+    return MLP(
+        in_features=in_features,
+        out_features=num_cells[-1],
+        num_cells=list(num_cells[:-1]),
+        activation_class=nn.ReLU,
+        activate_last_layer=True,
+    )
+
+
+def scaled_linear(in_features: int, out_features: int, gain: float) -> nn.Linear:
+    """Return a linear layer whose initial weights are torch's times ``gain`` and whose bias starts at zero."""
+    layer = nn.Linear(in_features, out_features)
+    with torch.no_grad():
+        layer.weight.mul_(gain)
+        layer.bias.zero_()
+    return layer
+
+
+def gate_diagnostics(gates: Tensor, saturation: float = 0.05) -> dict[str, Tensor]:
+    r"""Summarise gates ``(*B, K)`` as scalars: do the primitives share the work, does the gate still move?
+
+    ``sum`` is :math:`\sum_k w_k`, which divides the composite variance. ``saturation`` is the fraction of gates within
+    ``saturation`` of 0 or 1, where a sigmoid hardly learns. ``entropy`` (nats) and ``effective_primitives``, its
+    exponential, are those of the normalised weights. ``usage_k`` is the mean weight of primitive k.
+    """
+    gates = gates.detach().float().flatten(0, -2)
+    share = gates / gates.sum(-1, keepdim=True).clamp_min(torch.finfo(gates.dtype).tiny)
+    entropy = torch.special.entr(share).sum(-1)
+    diagnostics = {
+        "sum": gates.sum(-1).mean(),
+        "saturation": ((gates < saturation) | (gates > 1 - saturation)).float().mean(),
+        "entropy": entropy.mean(),
+        "effective_primitives": entropy.exp().mean(),
+    }
+    return diagnostics | {f"usage_{k}": usage for k, usage in enumerate(gates.mean(0))}

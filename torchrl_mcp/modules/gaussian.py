@@ -1,0 +1,52 @@
+"""The policy network of the scratch model."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+
+
+class GaussianPolicy(nn.Module):
+    r"""A network for the mean and a fixed diagonal covariance: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        num_cells: Hidden units.
+        std: Standard deviation, one for all actions or one each, in action units.
+        output_gain: Factor on the initial weights of the output layer.
+
+    Raises:
+        ValueError: If ``std`` is not positive or is neither one number nor one per action.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.2. https://arxiv.org/abs/1905.09808
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        goal_dim: int,
+        action_dim: int,
+        *,
+        num_cells: Sequence[int] = (1024, 512),
+        std: float | Sequence[float] = 0.1,
+        output_gain: float = 0.01,
+    ) -> None:
+        super().__init__()
+        scale = torch.as_tensor(std, dtype=torch.float32)
+        if scale.numel() not in (1, action_dim) or not (scale > 0).all():
+            raise ValueError(f"std must be one positive number or {action_dim} of them, one per action, got {std}")
+        self.body = relu_mlp(observation_dim + goal_dim, num_cells)
+        self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
+        self.register_buffer("scale", scale.expand(action_dim).clone())
+
+    def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, each ``(*B, A)``, from a state ``(*B, S)`` and a goal ``(*B, G)``."""
+        loc = self.output(self.body(observation, goal))
+        return loc, self.scale.expand_as(loc)

@@ -1,0 +1,69 @@
+"""Running normalisation of network inputs."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class RunningNormaliser(nn.Module):
+    r"""Standardise inputs by running statistics, then clip them.
+
+    .. math:: y = \operatorname{clip}\left(\frac{x - m}{\sqrt{v + \epsilon}}, -c, c\right)
+
+    The statistics are buffers that :meth:`update` changes in place, once per training iteration, so that the samples of
+    an iteration and the loss on them see the same numbers.
+
+    Args:
+        size: Number of input features, ``F``.
+        clip: Largest absolute output, :math:`c`.
+        max_count: Samples after which the statistics stay as they are.
+        epsilon: Added to the variance.
+
+    Raises:
+        ValueError: If ``size`` or ``clip`` is not positive.
+
+    Example:
+        >>> normaliser = RunningNormaliser(2)
+        >>> normaliser.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
+        >>> normaliser(torch.tensor([1.0, 30.0]))
+        tensor([0.0000, 1.0000])
+    """
+
+    mean: Tensor
+    variance: Tensor
+    count: Tensor
+
+    def __init__(self, size: int, *, clip: float = 10.0, max_count: float = math.inf, epsilon: float = 1e-8) -> None:
+        super().__init__()
+        if size < 1:
+            raise ValueError(f"size must be a positive number of features, got {size}")
+        if clip <= 0:
+            raise ValueError(f"clip must be positive, got {clip}")
+        self.clip = clip
+        self.max_count = max_count
+        self.epsilon = epsilon
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise ``x``, shape ``(*B, F)``."""
+        return ((x - self.mean) * (self.variance + self.epsilon).rsqrt()).clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, x: Tensor) -> None:
+        """Merge the samples ``x``, shape ``(*B, F)``, into the statistics.
+
+        Reference:
+            Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
+        """
+        if self.count >= self.max_count:
+            return
+        x = x.reshape(-1, x.shape[-1])
+        variance, mean = torch.var_mean(x, dim=0, correction=0)
+        share = (x.shape[0] / (self.count + x.shape[0])).to(mean.dtype)
+        delta = mean - self.mean
+        self.variance.copy_(self.variance + share * (variance - self.variance + (1 - share) * delta.square()))
+        self.mean.add_(share * delta)
+        self.count.add_(x.shape[0])

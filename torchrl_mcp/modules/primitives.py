@@ -1,0 +1,85 @@
+"""The primitives of Figure 3: K Gaussians that see the state and never the goal."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_mcp.modules.gating import relu_mlp
+
+
+class Primitives(nn.Module):
+    r"""K Gaussian primitives :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` on one shared trunk.
+
+    The trunk is followed by one hidden layer and one linear output layer per primitive. The branches are evaluated
+    together as batched matrix products.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        action_dim: Size of the action, ``A``.
+        num_primitives: Number of primitives, ``K``.
+        trunk_cells: Hidden units shared by all primitives.
+        branch_cells: Hidden units of each primitive's own layer.
+        initial_std: Standard deviation of every primitive before training, in action units.
+        output_gain: Factor on the initial weights of the output layers.
+
+    Raises:
+        ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Figure 3 and Eq. 4. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        num_primitives: int,
+        *,
+        trunk_cells: Sequence[int] = (512, 256),
+        branch_cells: int = 256,
+        initial_std: float = 1.0,
+        output_gain: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if num_primitives < 1:
+            raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
+        if not initial_std > 0:
+            raise ValueError(f"initial_std must be positive, got {initial_std}")
+        self.trunk = relu_mlp(observation_dim, trunk_cells)
+        self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells)
+        self.output = BatchedLinear(num_primitives, branch_cells, 2 * action_dim)
+        with torch.no_grad():
+            self.output.weight.mul_(output_gain)
+            self.output.bias.zero_()
+            self.output.bias[:, action_dim:] = math.log(initial_std)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
+        features = self.trunk(observation).unsqueeze(-2)
+        loc, log_scale = self.output(self.branches(features).relu()).chunk(2, dim=-1)
+        return loc, log_scale.float().exp()
+
+
+class BatchedLinear(nn.Module):
+    """K linear layers side by side: ``(*B, K, I)``, or ``(*B, 1, I)`` shared by all, to ``(*B, K, O)``.
+
+    Args:
+        num_layers: Number of layers, ``K``.
+        in_features: Input size, ``I``.
+        out_features: Output size, ``O``.
+    """
+
+    def __init__(self, num_layers: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        # nn.Linear's own initialisation, layer by layer.
+        layers = [nn.Linear(in_features, out_features) for _ in range(num_layers)]
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in layers]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply layer k to ``x[..., k, :]``."""
+        return (
+            torch.einsum("...ki,kio->...ko", x.expand(*x.shape[:-2], *self.bias.shape[:1], -1), self.weight) + self.bias
+        )

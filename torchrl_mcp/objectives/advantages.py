@@ -1,0 +1,55 @@
+"""Advantages and value targets for a batch of trajectories."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives.value import GAE
+
+
+class Advantages:
+    r"""GAE(:math:`\lambda`) with TD(:math:`\lambda`) value targets, bootstrapped at time limits.
+
+    The critic sees every state once. The value of a next state is that of the following sample, except where the
+    sample after it belongs to another episode or does not exist: there, after a time limit and at the end of the batch,
+    the critic evaluates the stored next observation. A terminated episode has no value beyond its end.
+
+    Rewards are scaled by :math:`1 - \gamma` first, so that returns have the size of a reward and the critic's outputs
+    are of order one for any discount.
+
+    Args:
+        critic: From ``observation`` and ``goal`` to ``state_value``.
+        gamma: Discount factor.
+        lmbda: Decay of both estimators.
+        clip: Largest absolute advantage after normalisation to zero mean and unit variance.
+
+    Reference:
+        Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage Estimation*, 2016.
+    """
+
+    def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
+        self.critic = critic
+        self.reward_scale = 1 - gamma
+        self.clip = clip
+        self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Add ``advantage`` and ``value_target``, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
+        value = self.critic(batch.select("observation", "goal")).get("state_value").float()
+        next_value = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], dim=1)
+        cut = batch["next", "truncated"].squeeze(-1).clone()
+        cut[:, -1] = True
+        next_value[cut] = self.critic(batch["next"][cut].select("observation", "goal"))["state_value"].float()
+
+        trajectories = batch.select(("next", "done"), ("next", "terminated"))
+        trajectories["state_value"] = value
+        trajectories["next", "state_value"] = next_value
+        trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
+        self.gae(trajectories)
+
+        advantage = trajectories["advantage"]
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
+        batch["advantage"] = advantage.clamp(-self.clip, self.clip)
+        batch["value_target"] = trajectories["value_target"]
+        batch["state_value"] = value
+        return batch

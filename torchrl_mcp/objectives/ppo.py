@@ -1,0 +1,55 @@
+"""PPO's loss with a penalty on out-of-bounds actions."""
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams
+from torch import Tensor
+from torch.distributions import Distribution
+from torchrl.objectives import ClipPPOLoss
+
+
+class BoundedClipPPOLoss(ClipPPOLoss):
+    r"""TorchRL's clipped PPO loss plus a penalty that keeps the mean action inside its bounds.
+
+    .. math:: L = L^{\mathrm{clip}} + c \, \mathbb{E} \sum_j \max(0, |\mu_j| - b)^2
+
+    The environment clips what leaves the bounds, so without the penalty nothing pulls such means back.
+
+    Args:
+        actor_network: The policy.
+        critic_network: The value function.
+        bound_coeff: Weight of the penalty, :math:`c`.
+        bound: Largest absolute mean action, :math:`b`.
+        **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
+
+    Reference:
+        Peng et al., *DeepMimic: Example-Guided Deep Reinforcement Learning of Physics-Based Character Skills*, 2018,
+        whose code bounds actions in this way; the MCP paper does not mention it.
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        *,
+        bound_coeff: float,
+        bound: float = 1.0,
+        **kwargs: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(actor_network, critic_network, **kwargs)
+        self.bound_coeff = bound_coeff
+        self.bound = bound
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add ``loss_bound`` to the terms of the clipped loss."""
+        out = super().forward(tensordict)
+        excess = (self._distribution.mean.abs() - self.bound).relu()
+        del self._distribution
+        return out.set("loss_bound", self.bound_coeff * excess.square().sum(-1).mean())
+
+    def _get_cur_log_prob(
+        self, tensordict: TensorDictBase, params: TensorDictParams | None = None
+    ) -> tuple[Tensor, Distribution, bool]:
+        log_prob, self._distribution, is_composite = super()._get_cur_log_prob(tensordict, params)
+        return log_prob, self._distribution, is_composite

@@ -1,0 +1,61 @@
+"""``torchrl-mcp-train``: train a method on a task, alone or in a Hydra multirun."""
+
+import difflib
+import sys
+from pathlib import Path
+
+import hydra
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_mcp import experiment
+
+
+@hydra.main(version_base="1.3", config_path="pkg://torchrl_mcp.conf", config_name="train")
+def run(cfg: DictConfig) -> None:
+    """Train as ``cfg`` says, or continue the run folder ``cfg.resume``."""
+    try:
+        folder = experiment.resume(Path(cfg.resume)) if cfg.resume else experiment.train(cfg)
+    except ValueError as error:
+        sys.exit(f"torchrl-mcp-train: {error}")
+    print(f"run folder: {folder}")
+
+
+def main() -> None:
+    """Run the command line, and where it names an unknown setting say which one was perhaps meant."""
+    try:
+        run()
+    except SystemExit as stop:
+        if stop.code == 1:
+            print(*suggestions(sys.argv[1:]), sep="\n", file=sys.stderr)
+        raise
+
+
+def suggestions(arguments: list[str]) -> list[str]:
+    """Return a line for each argument ``key=value`` whose key no configuration has, with the nearest that exist."""
+    try:
+        overrides = OverridesParser.create().parse_overrides([a for a in arguments if not a.startswith("-")])
+        with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+            cfg = compose("train", return_hydra_config=True)
+    except HydraException:
+        return []
+    groups = list(cfg.hydra.runtime.choices)
+    settings = list(_keys(OmegaConf.to_container(cfg)))
+    unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *settings}]
+    return [
+        f"{key!r} is no setting of this method; the nearest are: "
+        + ", ".join(difflib.get_close_matches(key, {*groups, *settings}, n=3, cutoff=0.5) or sorted(groups))
+        for key in unknown
+    ]
+
+
+def _keys(tree: object, prefix: str = "") -> list[str]:
+    if not isinstance(tree, dict):
+        return []
+    return [name for key, value in tree.items() for name in (f"{prefix}{key}", *_keys(value, f"{prefix}{key}."))]
+
+
+if __name__ == "__main__":
+    main()

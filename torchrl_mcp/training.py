@@ -1,0 +1,301 @@
+"""The training loop: collect, estimate advantages, update, record. One loop for every method."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.collectors import Collector
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
+from tqdm import tqdm
+
+from torchrl_mcp.actors import Actor
+from torchrl_mcp.checkpoint import load, run_checkpoint
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.episodes import EpisodeStatistics
+from torchrl_mcp.modules import gate_diagnostics
+from torchrl_mcp.objectives import Advantages
+from torchrl_mcp.record import Record
+from torchrl_mcp.transfer import FrozenParts
+
+
+@dataclass
+class Progress:
+    """How far a run is; part of its checkpoints."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+
+    def state_dict(self) -> dict[str, float]:
+        """Return the counters."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the counters."""
+        vars(self).update(state)
+
+
+@dataclass
+class Stopwatch:
+    """Wall-clock seconds by section."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, section: str) -> Iterator[None]:
+        """Time a block."""
+        start = time.perf_counter()
+        yield
+        self.add(section, time.perf_counter() - start)
+
+    def add(self, section: str, seconds: float) -> None:
+        """Add to a section."""
+        self.seconds[section] = self.seconds.get(section, 0.0) + seconds
+
+    def watch(self, section: str, module: nn.Module) -> None:
+        """Time every forward pass of ``module``."""
+        starts: list[float] = []
+        module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
+        module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))
+
+
+class Trainer:
+    """Proximal policy optimisation of an actor and a critic in one batch of environments.
+
+    Args:
+        env: Environments, batch size ``[N]``.
+        parts: All parts of the agent by name.
+        actor: The actor over those parts.
+        critic: The value function over those parts.
+        loss: Their loss; every output whose name begins with ``loss_`` is minimised.
+        advantages: Estimator of advantages and value targets.
+        actor_optimizer: Optimiser of the trainable parameters of the actor.
+        critic_optimizer: Optimiser of the parameters of the critic.
+        frozen: Parts that must not change, checked in every iteration.
+        record: Where metrics go.
+        checkpoints: Where checkpoints go.
+        config: The run's configuration, JSON-compatible, kept in every checkpoint.
+        total_frames: Environment steps of the run.
+        frames_per_batch: Environment steps per iteration, ``N * T``.
+        minibatch_size: Samples per gradient step.
+        num_epochs: Passes over each batch.
+        max_grad_norm: Largest gradient norm, of actor and critic each.
+        step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
+        autocast: Run all networks in bfloat16 autocast, in collection and loss alike.
+        device: Where the networks are; physics stays on the CPU.
+        checkpoint_interval: Iterations between checkpoints.
+        progress_bar: Show a progress bar.
+
+    Raises:
+        ValueError: If the batch does not divide evenly.
+    """
+
+    def __init__(
+        self,
+        *,
+        env: CharacterEnv,
+        parts: nn.ModuleDict,
+        actor: Actor,
+        critic: TensorDictModuleBase,
+        loss: ClipPPOLoss,
+        advantages: Advantages,
+        actor_optimizer: Optimizer,
+        critic_optimizer: Optimizer,
+        frozen: FrozenParts,
+        record: Record,
+        checkpoints: CheckpointRotation,
+        config: dict[str, Any],
+        total_frames: int,
+        frames_per_batch: int,
+        minibatch_size: int,
+        num_epochs: int,
+        max_grad_norm: float,
+        step_size_schedule: Callable[[Optimizer], KLAdaptiveLR] | None,
+        autocast: bool,
+        device: torch.device | str,
+        checkpoint_interval: int,
+        progress_bar: bool = True,
+    ) -> None:
+        if frames_per_batch % env.batch_size[0] or frames_per_batch % minibatch_size:
+            raise ValueError(
+                f"frames_per_batch={frames_per_batch} must be a multiple of num_envs={env.batch_size[0]} and of "
+                f"minibatch_size={minibatch_size}"
+            )
+        self.env, self.parts, self.actor, self.critic, self.loss = env, parts, actor, critic, loss
+        self.advantages = advantages
+        self.optimizers = {"actor": actor_optimizer, "critic": critic_optimizer}
+        self.schedule = step_size_schedule(actor_optimizer) if step_size_schedule else None
+        self.frozen, self.record, self.checkpoints, self.config = frozen, record, checkpoints, config
+        self.total_frames, self.frames_per_batch = total_frames, frames_per_batch
+        self.minibatch_size, self.num_epochs, self.max_grad_norm = minibatch_size, num_epochs, max_grad_norm
+        self.device, self.autocast = torch.device(device), autocast
+        self.checkpoint_interval, self.progress_bar = checkpoint_interval, progress_bar
+        self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(env.batch_size[0]), Stopwatch()
+        self.checkpoint: Checkpoint = run_checkpoint(
+            parts,
+            actor_optimizer=actor_optimizer,
+            critic_optimizer=critic_optimizer,
+            environment=env,
+            episodes=self.episodes,
+            frozen=frozen,
+            progress=self.progress,
+            random=GlobalRNGState(),
+        )
+
+    def run(self) -> None:
+        """Train until ``total_frames``, saving as it goes."""
+        collector = self._collector()
+        batches = iter(collector)
+        with tqdm(
+            total=self.total_frames, initial=self.progress.frames, unit="step", disable=not self.progress_bar
+        ) as bar:
+            while self.progress.frames < self.total_frames:
+                start, physics = time.perf_counter(), self.env.physics_seconds
+                self.stopwatch.seconds.clear()
+                with self._precision():
+                    batch = next(batches)
+                self.stopwatch.add("physics", self.env.physics_seconds - physics)
+                metrics = self._episode_metrics(batch) | self._gate_metrics(batch)
+                with self.stopwatch("update"):
+                    with self._precision():
+                        self.advantages(batch)
+                    metrics |= self._update(batch)
+                self._update_normalisers(batch)
+                self.frozen.verify()
+                self._advance(metrics, time.perf_counter() - start)
+                bar.set_postfix_str(self._summary(metrics), refresh=False)
+                bar.update(batch.numel())
+        collector.shutdown()
+
+    def restore(self, path: Path) -> None:
+        """Continue from the checkpoint file ``path``, to the same numbers as if nothing had happened.
+
+        Raises:
+            ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
+        """
+        load(self.checkpoint, path)
+        self.record.rewind(self.progress.iteration)
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
+
+    def _collector(self) -> Collector:
+        keys = ["action", self.actor.log_prob, *self.actor.stored]
+        behaviour = TensorDictSequential(self.actor.policy, selected_out_keys=list(dict.fromkeys(keys)))
+        self.stopwatch.watch("forward", behaviour)
+        random = GlobalRNGState().state_dict()
+        collector = Collector(
+            self.env,
+            behaviour,
+            frames_per_batch=self.frames_per_batch,
+            total_frames=-1,
+            env_device="cpu",
+            policy_device=self.device,
+            storing_device=self.device,
+            auto_register_policy_transforms=False,
+            track_traj_ids=False,
+        )
+        # Setting up a collector draws random numbers, which a resumed run must not notice.
+        GlobalRNGState().load_state_dict(random)
+        return collector
+
+    def _update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Take ``num_epochs`` passes of gradient steps over the batch; give the mean of everything the loss reports."""
+        keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
+        samples = batch.select(*keys, "advantage", "value_target", "state_value").flatten()
+        reports: list[TensorDict] = []
+        for _ in range(self.num_epochs):
+            order = torch.randperm(samples.shape[0], device=samples.device)
+            for index in order.split(self.minibatch_size):
+                with self._precision():
+                    report = self.loss(samples[index])
+                total = torch.stack([value for key, value in report.items() if key.startswith("loss_")]).sum()
+                total.backward()
+                for name, optimizer in self.optimizers.items():
+                    report.set(f"{name}_grad_norm", self._step(optimizer))
+                reports.append(report.detach())
+        mean = torch.stack([report.to_tensordict() for report in reports]).mean(0)
+        last = torch.stack(reports[-len(reports) // self.num_epochs :]).mean(0)
+        # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
+        kl = last["mean_ratio"] - 1 + last["kl_approx"]
+        metrics = {f"loss/{key}": value.item() for key, value in mean.items()} | {"loss/kl": kl.item()}
+        self._require_finite(metrics)
+        if self.schedule:
+            self.schedule.step(metrics["loss/kl"])
+        metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
+        with torch.no_grad(), self._precision():
+            distribution = self.actor.trained.get_dist(samples[: self.minibatch_size])
+        return metrics | {"policy/std": distribution.stddev.mean().item()}
+
+    def _step(self, optimizer: Optimizer) -> Tensor:
+        """Clip the gradient, step, and give the gradient's norm."""
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        return norm
+
+    def _require_finite(self, metrics: dict[str, float]) -> None:
+        for key, value in metrics.items():
+            if not abs(value) < float("inf"):
+                raise FloatingPointError(
+                    f"{key} became {value} in iteration {self.progress.iteration + 1}. The last checkpoint, "
+                    f"{self.checkpoints.latest()}, is from before; try a smaller step size or max_grad_norm"
+                )
+
+    def _update_normalisers(self, batch: TensorDictBase) -> None:
+        """Merge the batch into the input statistics, after the update so that collection and loss saw the same."""
+        for key in ("observation", "goal"):
+            if (name := f"{key}_normaliser") not in self.frozen:
+                self.parts[name].update(batch[key])
+
+    def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
+        returns, lengths = self.episodes.update(batch)
+        return {
+            "episode/count": len(returns),
+            "episode/return": returns.mean().item(),
+            "episode/normalised_return": self.env.normalised_return(returns).mean().item(),
+            "episode/length": lengths.mean().item(),
+            "episode/faults": self.env.num_faults,
+            "reward": batch["next", "reward"].mean().item(),
+        }
+
+    def _gate_metrics(self, batch: TensorDictBase) -> dict[str, float]:
+        if "gates" not in self.actor.stored:
+            return {}
+        return {f"gates/{key}": value.item() for key, value in gate_diagnostics(batch["gates"]).items()}
+
+    def _advance(self, metrics: dict[str, float], seconds: float) -> None:
+        """Count, record, and save if it is time."""
+        progress = self.progress
+        progress.iteration += 1
+        progress.frames += self.frames_per_batch
+        progress.seconds += seconds
+        shares = {section: self.stopwatch.seconds.get(section, 0.0) / seconds for section in SECTIONS}
+        shares["other"] = 1 - sum(shares.values())
+        metrics |= {f"time/{section}": share for section, share in shares.items()}
+        metrics["time/steps_per_second"] = self.frames_per_batch / seconds
+        self.record.write(vars(progress) | metrics, step=progress.frames)
+        if progress.iteration % self.checkpoint_interval == 0 or progress.frames >= self.total_frames:
+            self.save()
+
+    def _summary(self, metrics: dict[str, float]) -> str:
+        shares = " ".join(f"{section} {metrics[f'time/{section}']:.0%}" for section in (*SECTIONS, "other"))
+        return f"return {metrics['episode/normalised_return']:.3f} | {shares}"
+
+    def _precision(self) -> torch.autocast:
+        # Entered anew for every use: within one context autocast keeps its copies of the weights.
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
+
+
+SECTIONS = ("physics", "forward", "update")
