@@ -22,21 +22,22 @@ class CharacterEnv(EnvBase):
     The class owns stepping, specs, partial resets, seeding, the time limit, snapshots and faults. What a task remembers
     beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
 
-    A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward 0
-    and the observation from before the step, and ``num_faults`` counts it.
+    A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward
+    0 and the observation from before the step, and ``num_faults`` counts it.
 
     Args:
         model: Character and scene.
         num_envs: Number N of simulations.
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
-        episode: Initial values of what the task remembers, each ``(N, ...)``.
+        episode: What the task remembers of one simulation at first; kept as ``(N, ...)``.
         outputs: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
         persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         dtype: Type of what is emitted; physics and reward are computed in float64.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking.
+        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (TorchRL merges what a partial
+            reset emits into new tensors, which are not pinned.)
 
     Raises:
         ValueError: If an argument is out of range.
@@ -60,10 +61,14 @@ class CharacterEnv(EnvBase):
         dtype: torch.dtype = torch.float32,
         pin_memory: bool = False,
     ) -> None:
-        least = {"num_envs": (num_envs, 1), "max_episode_steps": (max_episode_steps, 1), "num_threads": (num_threads, 0)}
-        for name, (value, bound) in least.items():
-            if value < bound:
-                raise ValueError(f"{name}={value} is too small: pass at least {bound}")
+        counts = [
+            ("num_envs", num_envs, 1),
+            ("max_episode_steps", max_episode_steps, 1),
+            ("num_threads", num_threads, 0),
+        ]
+        for name, value, least in counts:
+            if value < least:
+                raise ValueError(f"{name}={value} is too small: pass at least {least}")
         if pin_memory and not torch.cuda.is_available():
             raise ValueError("pin_memory=True speeds up copies to a CUDA device, and none is available: pass False")
         super().__init__(device="cpu", batch_size=[num_envs])
@@ -72,7 +77,8 @@ class CharacterEnv(EnvBase):
         self.simulation = Simulation(
             model, num_envs, substeps=substeps, outputs=outputs, num_threads=num_threads, persistent=persistent
         )
-        self.episode = {"elapsed_steps": torch.zeros(num_envs, 1, dtype=torch.int64), **episode}
+        episode = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
+        self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()}
         self.num_faults = 0
         self._snapshot: TensorDict | None = None
         self.generator = torch.Generator()
@@ -121,7 +127,8 @@ class CharacterEnv(EnvBase):
     def _make_specs(self) -> None:
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
-        low, high = torch.from_numpy(self.simulation.model.actuator_ctrlrange).to(self._dtype).expand(self.num_envs, -1, -1).unbind(-1)
+        bounds = torch.from_numpy(self.simulation.model.actuator_ctrlrange).to(self._dtype)
+        low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
         observed = {key: Unbounded(value.shape, dtype=self._dtype) for key, value in self._observe().items()}
         self.observation_spec = Composite(observed, shape=shape)
         self.action_spec = Bounded(low, high, dtype=self._dtype)
@@ -150,9 +157,7 @@ class CharacterEnv(EnvBase):
         truncated = self.episode["elapsed_steps"] >= self.max_episode_steps
         return self._emit(reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any
-    ) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if self._snapshot is not None and mask is None and not set_state:
             snapshot, self._snapshot = self._snapshot, None
@@ -172,8 +177,8 @@ class CharacterEnv(EnvBase):
     def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:
         """Rows ``ids`` of the state in ``tensordict``, or an error that says what is wrong with it."""
         known = {**self.simulation.state, **self.episode}
-        emitted = {"_reset", *self.observation_spec.keys(), *self.done_keys}
-        given = {} if tensordict is None else {k: v for k, v in tensordict.items() if k in known or k not in emitted}
+        ignored = {"_reset", "next", "action", "reward", *self.observation_spec.keys(), *self.done_keys} - known.keys()
+        given = {} if tensordict is None else {k: v for k, v in tensordict.items() if k not in ignored}
         if missing := {"qpos", "qvel"} - given.keys():
             raise ValueError(f"set_state=True without {sorted(missing)}: pass at least qpos and qvel, or get_state()")
         for key, value in given.items():

@@ -94,12 +94,9 @@ class Holdout(CharacterEnv):
             if not 0.0 <= value < math.inf:
                 raise ValueError(f"{name}={value} is not a finite number of at least 0: costs carry their sign already")
         model = ant().compile()
-        episode = {
-            "goal": torch.zeros(num_envs, 2, dtype=dtype),
-            "position": torch.zeros(num_envs, 2, dtype=torch.float64),
-        }
+        episode = {"goal": torch.zeros(2, dtype=dtype), "position": torch.zeros(2, dtype=torch.float64)}
         if contact_forces:
-            episode["contact_forces"] = torch.zeros(num_envs, model.nbody, 6, dtype=torch.float64)
+            episode["contact_forces"] = torch.zeros(model.nbody, 6, dtype=torch.float64)
         super().__init__(
             model,
             num_envs,
@@ -115,8 +112,13 @@ class Holdout(CharacterEnv):
         )
         self.directions, self.reset_noise_scale = directions, reset_noise_scale
         self.healthy_z_range, self.terminate_when_unhealthy = healthy_z_range, terminate_when_unhealthy
-        weights = {name: value for name, value in scales.items() if name.endswith("_weight")}
-        self._reward = partial(holdout_reward, **weights)
+        self._reward = partial(
+            holdout_reward,
+            forward_weight=forward_weight,
+            healthy_weight=healthy_weight,
+            control_weight=control_weight,
+            contact_weight=contact_weight,
+        )
         # Live views, made once. Gymnasium measures velocities with the body's xpos, one stage of RK4 before the state.
         qpos, self._qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
         self._height, self._posture = qpos[:, 2], qpos[:, 2:]
@@ -132,6 +134,8 @@ class Holdout(CharacterEnv):
         Gymnasium's ``reward_threshold`` for Ant-v5. The paper's normalisation is not documented.
         """
         spec = gymnasium.spec("Ant-v5")
+        assert spec.reward_threshold is not None
+        assert spec.max_episode_steps is not None
         return episode_return / (self.max_episode_steps * spec.reward_threshold / spec.max_episode_steps)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
@@ -162,20 +166,25 @@ class Holdout(CharacterEnv):
         healthy = self._height == self._height.clamp(*self.healthy_z_range)
         contacts = None
         if "contact_forces" in self.episode:
-            moved = torch.ones(self.num_envs).index_fill(0, faults, 0.0).nonzero().squeeze(-1)
-            self.episode["contact_forces"][moved] = self.simulation.contact_forces(moved).clamp(*CONTACT_FORCE_RANGE)
-            contacts = self.episode["contact_forces"].flatten(1)
+            forces = self.simulation.contact_forces().clamp(*CONTACT_FORCE_RANGE)
+            forces[faults] = self.episode["contact_forces"][faults]
+            contacts = self.episode["contact_forces"].copy_(forces).flatten(1)
         action = self.simulation.state["ctrl"]
         reward = self._reward(velocity, self.episode["goal"], action, healthy, contacts)
         return reward, ~healthy if self.terminate_when_unhealthy else torch.zeros_like(healthy)
 
     def _arrows(self, index: int) -> list[Arrow]:
-        tail = self.simulation.state["qpos"][index, :3].numpy() + [0.0, 0.0, 0.6]
-        return [(tail, tail + [*self.episode["goal"][index].tolist(), 0.0])]
+        tail = self.simulation.state["qpos"][index, :3] + torch.tensor([0.0, 0.0, 0.6])
+        tip = tail + torch.nn.functional.pad(self.episode["goal"][index], (0, 1))
+        return [(tail.numpy(), tip.double().numpy())]
 
 
 def _interval(name: str, value: Sequence[float]) -> tuple[float, float]:
     """Check that ``value`` is a pair of finite numbers in order."""
-    if len(value) != 2 or not -math.inf < value[0] <= value[1] < math.inf:
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not -math.inf < low <= high < math.inf:
         raise ValueError(f"{name}={value!r} is no interval: pass two finite numbers (lo, hi), lo <= hi")
-    return float(value[0]), float(value[1])
+    return low, high

@@ -23,12 +23,16 @@ class Camera:
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1, distance: float = 4.0
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1, distance: float = 4.0) -> None:
         buffer = model.vis.global_
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
-        self.renderer = mujoco.Renderer(model, height, width)
+        try:
+            self.renderer = mujoco.Renderer(model, height, width)
+        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+            raise RuntimeError(
+                "MuJoCo found no OpenGL to draw with. Without a display, set the environment variable MUJOCO_GL before "
+                "Python starts: to egl (Debian: apt install libegl1) or to osmesa (Debian: apt install libosmesa6)"
+            ) from error
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self.view.trackbodyid, self.view.distance = body, distance

@@ -2,7 +2,8 @@
 
 import copy
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -37,15 +38,16 @@ class Simulation:
 
     A simulation *faults* in a step when MuJoCo raises an error in it, when its state leaves the finite numbers below
     ``LARGEST``, or when its controls do. It then keeps the state it had before the step, and its neighbours do not
-    notice. MuJoCo's own answer to a divergence, a silent reset in the middle of a step, is switched off.
+    notice. MuJoCo's own answer to a divergence, a silent reset in the middle of a step, is switched off; its warnings
+    still reach ``MUJOCO_LOG.TXT`` in the working directory and say what happened.
 
     Args:
         model: The compiled model; a copy is kept.
         num_envs: Number N of simulations.
         substeps: Physics steps per call of :meth:`step`.
         num_threads: Threads; 0 takes one per processor. Results do not depend on it.
-        outputs: The other ``MjData`` fields to expose. After :meth:`step` they are one substep behind the state, as after
-            ``mj_step``; after :meth:`reset` they are current.
+        outputs: The other ``MjData`` fields to expose. After :meth:`step` they are one substep behind the state, as
+            after ``mj_step``; after :meth:`reset` they are current.
         persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
     """
 
@@ -84,22 +86,17 @@ class Simulation:
         Returns:
             The simulations that faulted, shape ``(n,)``, int64; usually none.
         """
+        controls = ctrl.detach().numpy()
         np.copyto(self._before, self._rows)
-        controls = ctrl.numpy()
         np.copyto(self._fields["ctrl"], controls)
-        start, failed = time.perf_counter(), []
-        try:
-            self._batch.step(nstep=self.substeps)
-        except SimulationError as error:
-            failed = error.ids
-        self.physics_seconds += time.perf_counter() - start
+        failed = self._run(self._batch.step, nstep=self.substeps)
         if not len(failed) and _bounded(controls) and _bounded(self._rows):
-            return _NONE
+            return torch.from_numpy(_NOBODY)
         faults = ~(_bounded(controls, -1) & _bounded(self._rows, -1))
         faults[failed] = True
         ids = faults.nonzero()[0]
         self._rows[ids] = self._before[ids]
-        self._forward(ids)
+        self._run(self._batch.forward, ids)  # outputs that cannot be computed stay as they are
         self._rows[ids] = self._before[ids]
         return torch.from_numpy(ids)
 
@@ -114,30 +111,28 @@ class Simulation:
         self._rows[rows] = self._initial
         for name, value in fields.items():
             self._fields[name][rows] = value.numpy()
-        self._forward(rows)
+        if len(failed := self._run(self._batch.forward, rows)):
+            raise ValueError(f"MuJoCo cannot compute the state given to simulation {failed[0]}: correct it")
         if "qacc_warmstart" in fields:  # mj_forward replaced it
             self._fields["qacc_warmstart"][rows] = fields["qacc_warmstart"].numpy()
 
-    def contact_forces(self, ids: Tensor) -> Tensor:
+    def contact_forces(self) -> Tensor:
         """External contact forces on every body, MuJoCo's ``cfrc_ext``, at the time of the outputs.
 
-        ``mj_step`` leaves them to ``mj_rnePostConstraint``, which ``Batch`` cannot call: each simulation's ``MjData`` is
-        copied out to Python, about 20 microseconds a piece on one thread.
-
-        Args:
-            ids: The n simulations, shape ``(n,)``, int64.
+        ``mj_step`` leaves them to ``mj_rnePostConstraint``, which ``Batch`` cannot call: each ``MjData`` is copied out
+        to Python, about 20 microseconds a piece on one thread.
 
         Returns:
-            Torques and forces about the centre of mass, shape ``(n, bodies, 6)``, in N m and N.
+            Torques and forces about the centre of mass, shape ``(N, bodies, 6)``, in N m and N.
         """
-        forces = torch.empty(len(ids), self.model.nbody, 6, dtype=torch.float64)
+        forces = np.empty((len(self._rows), self.model.nbody, 6))
         start = time.perf_counter()
-        for row, index in enumerate(ids.tolist()):
+        for index, row in enumerate(forces):
             self._batch.get_data(index, self._data)
             mujoco.mj_rnePostConstraint(self.model, self._data)
-            forces[row] = torch.from_numpy(self._data.cfrc_ext)
+            row[:] = self._data.cfrc_ext
         self.physics_seconds += time.perf_counter() - start
-        return forces
+        return torch.from_numpy(forces)
 
     def data(self, index: int) -> mujoco.MjData:
         """One simulation as an ``MjData`` with everything computed, to draw it or to look into it."""
@@ -145,13 +140,19 @@ class Simulation:
         mujoco.mj_forward(self.model, self._data)
         return self._data
 
-    def _forward(self, ids: np.ndarray) -> None:
+    def _run(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> np.ndarray:
+        """Call MuJoCo, count the time, and return the simulations in which it raised an error."""
         start = time.perf_counter()
-        self._batch.forward(ids)
-        self.physics_seconds += time.perf_counter() - start
+        try:
+            call(*args, **kwargs)
+        except SimulationError as error:
+            return error.ids
+        finally:
+            self.physics_seconds += time.perf_counter() - start
+        return _NOBODY
 
 
-_NONE = torch.empty(0, dtype=torch.int64)
+_NOBODY = np.empty(0, dtype=np.int64)
 
 
 def _bounded(values: np.ndarray, axis: int | None = None) -> np.ndarray:

@@ -74,7 +74,7 @@ def composite_parts(
     initial_std: float,
     normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
-    """Make the parts of a composite policy: ``observation_normaliser``, ``goal_normaliser``, ``gating``, ``primitives``.
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating`` and ``primitives``.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -87,7 +87,12 @@ def composite_parts(
         distribution_class: The mixer, of ``(loc, scale, gates)``.
         initial_std: Standard deviation of the *composite* before training, in action units, whatever ``K`` and mixer.
         normaliser: Makes an input normaliser from a size.
+
+    Raises:
+        ValueError: If ``num_primitives`` is not positive.
     """
+    if num_primitives < 1:
+        raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
     # Both mixers scale with their primitives: compose K unit Gaussians at the gate's initial weights and divide.
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
@@ -112,7 +117,7 @@ def gaussian_parts(
     policy: Callable[..., nn.Module],
     normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
-    """Make the parts of the scratch model: ``observation_normaliser``, ``goal_normaliser``, ``policy``.
+    """Make the parts of the scratch model: ``observation_normaliser``, ``goal_normaliser`` and ``policy``.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -265,4 +270,5 @@ class DeterministicAction(nn.Module):
 
     def forward(self, loc: Tensor, scale: Tensor, gates: Tensor) -> Tensor:
         """Return the action ``(*B, A)`` of primitives ``(*B, K, A)`` under gates ``(*B, K)``."""
-        return self.distribution_class(loc, scale, gates).deterministic_sample
+        action: Tensor = self.distribution_class(loc, scale, gates).deterministic_sample  # type: ignore[attr-defined]
+        return action

@@ -17,10 +17,20 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 FOLDER = "checkpoints"
 
 # What torchrl, tensordict, zipfile and json raise when a file is damaged or of another kind.
-UNREADABLE = (AttributeError, BadZipFile, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, zlib.error)
+UNREADABLE = (
+    AttributeError,
+    BadZipFile,
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    zlib.error,
+)
 
 
-def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:  # noqa: ANN401
+def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:
     """Return the checkpoint of a run: its ``parts``, each under its name, and further ``components`` with state."""
     return Checkpoint(format="archive", **{_component(name): part for name, part in parts.items()}, **components)
 

@@ -5,10 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-import torch
-
-from torchrl_mcp import experiment
-from torchrl_mcp.evaluation import evaluate, summary
+from torchrl_mcp.experiment import evaluate_run
 
 
 def main() -> None:
@@ -25,24 +22,14 @@ def main() -> None:
         sys.exit(f"torchrl-mcp-evaluate: {error}")
     print(f"{arguments.path}: {arguments.episodes} episodes, seed {arguments.seed}")
     for mode, numbers in results.items():
+        low, high = numbers["interval"]
         print(
-            f"  {mode:13} normalised return {numbers['normalised_return']:.3f} +- {numbers['normalised_return_std']:.3f} "
-            f"(95 % interval of the mean {numbers['interval'][0]:.3f} to {numbers['interval'][1]:.3f}), "
+            f"  {mode:13} normalised return {numbers['normalised_return']:.3f} "
+            f"(95 % interval of the mean {low:.3f} to {high:.3f}, std {numbers['normalised_return_std']:.3f}), "
             f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
         )
     if arguments.output:
         arguments.output.write_text(json.dumps(results, indent=2) + "\n")
-
-
-def evaluate_run(path: Path, *, episodes: int, seed: int) -> dict[str, dict]:
-    """Return the :func:`~torchrl_mcp.evaluation.summary` of the run's policy, ``deterministic`` and ``stochastic``."""
-    results = {}
-    for mode in ("deterministic", "stochastic"):
-        _, agent, env = experiment.restore(path, num_envs=episodes, seed=seed)
-        torch.manual_seed(seed)
-        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic")
-        results[mode] = summary(outcome, env.normalised_return)
-    return results
 
 
 if __name__ == "__main__":

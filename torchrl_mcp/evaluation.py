@@ -18,7 +18,7 @@ class Evaluation:
         returns: Undiscounted sum of rewards of each episode, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
-        positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN from an episode's end on.
+        positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
     """
 
     returns: Tensor

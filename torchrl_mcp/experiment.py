@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra.utils import instantiate
@@ -15,6 +15,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl_mcp import checkpoint
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.evaluation import evaluate, summary
 from torchrl_mcp.record import Record
 from torchrl_mcp.training import Trainer
 from torchrl_mcp.transfer import FrozenParts, require_parts
@@ -32,7 +33,7 @@ class Agent:
     frozen: FrozenParts
 
 
-def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv:  # noqa: ANN401
+def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv:
     """Return the environments of the configured task and stage."""
     return instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
 
@@ -63,8 +64,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv, folder: Path)
     optimizers = {f"{name}_optimizer": instantiate(cfg.optimizer[name])(p) for name, p in trainable.items()}
     loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
     loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob, value="state_value")
-    training = OmegaConf.to_container(cfg.training)
-    del training["num_envs"]
+    training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
     return Trainer(
         env=env,
         parts=agent.parts,
@@ -76,7 +76,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv, folder: Path)
         frozen=agent.frozen,
         record=Record(folder),
         checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
-        config=OmegaConf.to_container(cfg, resolve=True),
+        config=cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)),
         max_grad_norm=cfg.objective.max_grad_norm,
         step_size_schedule=instantiate(cfg.optimizer.schedule),
         autocast=cfg.autocast,
@@ -98,9 +98,10 @@ def train(cfg: DictConfig) -> Path:
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
     trainer = _trainer(cfg, folder, _pretrained(cfg))
     folder.mkdir(parents=True, exist_ok=True)
+    trainer.save()
+    # Last, because it is what says that there is a run to resume.
     OmegaConf.save(cfg, folder / CONFIG, resolve=True)
     trainer.record.loggers = _loggers(cfg)
-    trainer.save()
     trainer.run()
     return folder
 
@@ -113,7 +114,7 @@ def resume(folder: Path) -> Path:
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
-    cfg = OmegaConf.load(folder / CONFIG)
+    cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
     trainer = _trainer(cfg, folder)
     trainer.restore(checkpoint.find(folder))
     trainer.record.loggers = _loggers(cfg)
@@ -143,6 +144,27 @@ def restore(
     agent = make_agent(cfg, env)
     checkpoint.load_parts(agent.parts, list(agent.parts), file)
     return cfg, agent, env
+
+
+def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
+    """Return the :func:`~torchrl_mcp.evaluation.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    results = {}
+    for mode in ("deterministic", "stochastic"):
+        _, agent, env = restore(path, num_envs=episodes, seed=seed, **kwargs)
+        torch.manual_seed(seed)
+        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic")
+        results[mode] = summary(outcome, env.normalised_return)
+    return results
 
 
 def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> Trainer:

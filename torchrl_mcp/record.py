@@ -31,17 +31,19 @@ class Record:
                 writer.writeheader()
             writer.writerow(dict(metrics))
         for logger in self.loggers:
-            logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)  # noqa: PLR0124 - not NaN
+            logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)
 
     def rewind(self, iteration: int) -> None:
         """Drop the rows after ``iteration``, which a run wrote that was killed before its next checkpoint."""
         if not self.path.exists():
             return
         with self.path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            rows = [row for row in reader if None not in row.values() and int(row["iteration"]) <= iteration]
-            self._columns = list(reader.fieldnames or [])
+            rows = csv.DictReader(file)
+            kept = [row for row in rows if None not in row.values() and int(row["iteration"]) <= iteration]
+        # Without rows the header may be cut short as well: the next row writes it anew.
+        self._columns = list(kept[0]) if kept else []
         with self.path.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
-            writer.writeheader()
-            writer.writerows(rows)
+            if kept:
+                writer.writeheader()
+            writer.writerows(kept)

@@ -38,12 +38,14 @@ def suggestions(arguments: list[str]) -> list[str]:
     try:
         overrides = OverridesParser.create().parse_overrides([a for a in arguments if not a.startswith("-")])
         with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-            cfg = compose("train", return_hydra_config=True)
+            groups = list(compose("train", return_hydra_config=True).hydra.runtime.choices)
+            # A choice of method or preset brings settings of its own.
+            chosen = [str(o.input_line) for o in overrides if o.key_or_group in groups and not o.is_sweep_override()]
+            cfg = compose("train", chosen, return_hydra_config=True)
     except HydraException:
         return []
-    groups = list(cfg.hydra.runtime.choices)
-    settings = list(_keys(OmegaConf.to_container(cfg)))
-    unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *settings}]
+    settings = _keys(OmegaConf.to_container(cfg))
+    unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *settings} and not o.is_add()]
     return [
         f"{key!r} is no setting of this method; the nearest are: "
         + ", ".join(difflib.get_close_matches(key, {*groups, *settings}, n=3, cutoff=0.5) or sorted(groups))

@@ -1,14 +1,12 @@
 """The training loop: collect, estimate advantages, update, record. One loop for every method."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -21,51 +19,11 @@ from torchrl_mcp.actors import Actor
 from torchrl_mcp.checkpoint import load, run_checkpoint
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.episodes import EpisodeStatistics
-from torchrl_mcp.modules import gate_diagnostics
+from torchrl_mcp.modules import RunningNormaliser, gate_diagnostics
 from torchrl_mcp.objectives import Advantages
+from torchrl_mcp.progress import SECTIONS, Progress, Stopwatch
 from torchrl_mcp.record import Record
 from torchrl_mcp.transfer import FrozenParts
-
-
-@dataclass
-class Progress:
-    """How far a run is; part of its checkpoints."""
-
-    iteration: int = 0
-    frames: int = 0
-    seconds: float = 0.0
-
-    def state_dict(self) -> dict[str, float]:
-        """Return the counters."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the counters."""
-        vars(self).update(state)
-
-
-@dataclass
-class Stopwatch:
-    """Wall-clock seconds by section."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, section: str) -> Iterator[None]:
-        """Time a block."""
-        start = time.perf_counter()
-        yield
-        self.add(section, time.perf_counter() - start)
-
-    def add(self, section: str, seconds: float) -> None:
-        """Add to a section."""
-        self.seconds[section] = self.seconds.get(section, 0.0) + seconds
-
-    def watch(self, section: str, module: nn.Module) -> None:
-        """Time every forward pass of ``module``."""
-        starts: list[float] = []
-        module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
-        module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))
 
 
 class Trainer:
@@ -213,22 +171,20 @@ class Trainer:
         """Take ``num_epochs`` passes of gradient steps over the batch; give the mean of everything the loss reports."""
         keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
         samples = batch.select(*keys, "advantage", "value_target", "state_value").flatten()
-        reports: list[TensorDict] = []
+        reports: list[TensorDictBase] = []
         for _ in range(self.num_epochs):
             order = torch.randperm(samples.shape[0], device=samples.device)
             for index in order.split(self.minibatch_size):
                 with self._precision():
                     report = self.loss(samples[index])
-                total = torch.stack([value for key, value in report.items() if key.startswith("loss_")]).sum()
-                total.backward()
+                sum(value for key, value in report.items() if key.startswith("loss_")).backward()
                 for name, optimizer in self.optimizers.items():
                     report.set(f"{name}_grad_norm", self._step(optimizer))
                 reports.append(report.detach())
-        mean = torch.stack([report.to_tensordict() for report in reports]).mean(0)
-        last = torch.stack(reports[-len(reports) // self.num_epochs :]).mean(0)
+        metrics = {f"loss/{key}": value for key, value in _mean(reports).items()}
+        last = _mean(reports[-len(reports) // self.num_epochs :])
         # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
-        kl = last["mean_ratio"] - 1 + last["kl_approx"]
-        metrics = {f"loss/{key}": value.item() for key, value in mean.items()} | {"loss/kl": kl.item()}
+        metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
         self._require_finite(metrics)
         if self.schedule:
             self.schedule.step(metrics["loss/kl"])
@@ -257,7 +213,7 @@ class Trainer:
         """Merge the batch into the input statistics, after the update so that collection and loss saw the same."""
         for key in ("observation", "goal"):
             if (name := f"{key}_normaliser") not in self.frozen:
-                self.parts[name].update(batch[key])
+                cast("RunningNormaliser", self.parts[name]).update(batch[key])
 
     def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         returns, lengths = self.episodes.update(batch)
@@ -298,4 +254,6 @@ class Trainer:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
 
 
-SECTIONS = ("physics", "forward", "update")
+def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
+    """Average scalars over reports of the same keys."""
+    return {key: torch.stack([report[key] for report in reports]).mean().item() for key in reports[0].keys()}  # noqa: SIM118

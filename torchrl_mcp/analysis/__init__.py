@@ -1,4 +1,4 @@
-"""The paper's figures, from run folders and policies: functions of data, which never touch matplotlib's global state."""
+"""The paper's figures, from run folders and policies. Nothing here touches matplotlib's global state."""
 
 from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure

@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from torchrl_mcp.analysis.figures import COLOURS, bare, new_figure
+from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
 
 Array = NDArray[np.float64]
 
@@ -57,10 +58,10 @@ def learning_curves(
 ) -> list[Curve]:
     """Return one curve per group on a common grid of steps, for what every seed of the group has reached.
 
-    Steps are divided into ``num_bins`` equal bins up to the end of the longest run. A bin holds the mean of a run's rows,
-    weighted by ``episode/count`` where the quantity is a mean over episodes. Bins without an episode in them are
-    interpolated. Bins should be no shorter than an episode in all environments: in shorter ones the episodes that fail
-    early can be among themselves.
+    Steps are divided into ``num_bins`` equal bins up to the last value of the longest run. A bin holds the mean of a
+    run's rows, weighted by ``episode/count`` where the quantity is a mean over episodes. Bins in which no episode ended
+    are interpolated. A bin should be no shorter than an episode of all environments together: in a shorter one the
+    episodes that failed early can be among themselves.
 
     Args:
         groups: Run folders, one per seed, by the label of their curve.
@@ -94,15 +95,16 @@ def draw_curves(
     """Draw curves as lines, each with the range of its seeds as a band around it."""
     figure = new_figure(6.4, 3.6)
     axes = figure.add_subplot()
-    for curve, colour in zip(curves, COLOURS, strict=False):
+    for curve, colour in zip(curves, cycle(COLOURS), strict=False):
         axes.fill_between(curve.frames, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(curve.frames, curve.mean, color=colour, linewidth=2, label=_legend(curve), solid_capstyle="round")
     axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]) if min(curve.low.min() for curve in curves) < 0 else 0.0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(axis="y", color="#EEEEEE")
     axes.set_axisbelow(True)
     bare(axes)
-    figure.legend(loc="outside upper center", ncols=min(len(curves), 3), frameon=False, fontsize=9)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 

@@ -75,38 +75,39 @@ def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
     A path has the colour of its target direction, which the mark of that colour on the outer ring shows: perfect paths
     are rays towards their marks.
     """
-    positions = [trajectories.positions[np.isfinite(trajectories.positions)] for trajectories in panels.values()]
-    rings = _rings(max((float(np.abs(p).max(initial=0.0)) for p in positions), default=0.0))
-    figure = new_figure(3.3 * len(panels), 3.75)
+    rings = _rings(max(_reach(panel) for panel in panels.values()))
+    figure = new_figure(3.3 * len(panels), 4.0)
     for column, (title, trajectories) in enumerate(panels.items(), start=1):
         axes = figure.add_subplot(1, len(panels), column)
         _draw_compass(axes, rings)
         _draw_paths(axes, trajectories, 1.06 * rings[-1])
-        axes.set_title(title, fontsize=10, color=INK)
+        axes.set_title(title, fontsize=11, color=INK)
+    figure.supxlabel(f"rings: {rings[0]:g} m apart; marks: target directions", fontsize=9, color=INK)
     return figure
 
 
+def _reach(trajectories: Trajectories) -> float:
+    """Return the greatest distance from the origin, in metres."""
+    return float(np.nanmax(np.linalg.norm(trajectories.positions, axis=-1), initial=0.0))
+
+
 def _rings(reach: float) -> Sequence[float]:
-    """Round distances in metres, the last of which is at least ``reach``."""
+    """Return round distances in metres, equally spaced, the last of which is at least ``reach``."""
     ticks = MaxNLocator(nbins=3, steps=[1, 2, 4, 5, 10]).tick_values(0.0, max(reach, 1e-3))
     return [float(tick) for tick in ticks if tick > 0]
 
 
 def _draw_compass(axes: Axes, rings: Sequence[float]) -> None:
-    """Rings of equal distance, and angles around the outermost."""
+    """Draw rings of equal distance, and name the quarters around the outermost."""
     angle = np.linspace(0.0, 2 * math.pi, 361)
     for radius in rings:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=FAINT, linewidth=0.8, zorder=0)
-        axes.annotate(
-            f"{radius:g} m", (0.0, radius), ha="center", va="center", fontsize=7, color="#777777",
-            bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"},
-        )  # fmt: skip
     for label, at in QUARTERS.items():
-        radius = 1.2 * rings[-1]
-        axes.annotate(label, (radius * math.cos(at), radius * math.sin(at)), ha="center", va="center", color=INK)
-    limit = 1.3 * rings[-1]
-    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
-    axes.axis("off")
+        x, y = 1.2 * rings[-1] * math.cos(at), 1.2 * rings[-1] * math.sin(at)
+        axes.annotate(label, (x, y), ha="center", va="center", fontsize=9, color=INK)
+    limit = 1.28 * rings[-1]
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
 
 
 def _draw_paths(axes: Axes, trajectories: Trajectories, rim: float) -> None:

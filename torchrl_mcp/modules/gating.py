@@ -48,7 +48,7 @@ class Gating(nn.Module):
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         features = torch.cat([self.state_encoder(observation), self.goal_encoder(goal)], dim=-1)
-        return self.output(self.joint(features))
+        return self.output(self.joint(features)).float()
 
 
 def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:

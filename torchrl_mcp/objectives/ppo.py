@@ -35,7 +35,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         *,
         bound_coeff: float,
         bound: float = 1.0,
-        **kwargs: Any,  # noqa: ANN401
+        **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, critic_network, **kwargs)
         self.bound_coeff = bound_coeff

@@ -1,0 +1,298 @@
+"""Environment steps per second: ours beside bare MuJoCo, Gymnasium, EnvPool and TorchRL's own environments.
+
+    python benchmarks/throughput.py            # about five minutes, writes results/throughput_env.csv
+    python benchmarks/throughput.py --quick    # about one
+
+Every contender simulates Ant-v5 (5 physics steps per action, contact observations and costs off but where said), acts
+at random and resets fallen ants. Each has a process of its own; those of one size measure in turns while the others
+wait, so that a busy machine slows all of them. A speed is the median over rounds, a ratio the median of the rounds'.
+
+Environments that take a process each are measured up to twice as many as processors, Gymnasium's up to 64: more of them
+gain nothing. EnvPool is measured where it is installed; ``--envpool-python`` names the interpreter that has it.
+"""
+
+import argparse
+import csv
+import importlib.metadata
+import importlib.util
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results" / "throughput_env.csv"
+SIZES = (1, 64, 256, 1024)
+SUBSTEPS = 5
+HEALTHY_Z = (0.2, 1.0)
+ANT = {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0}
+
+Step = Callable[[int], None]
+
+
+def actions(num_envs: int) -> np.ndarray:
+    """Random actions, 32 of them to go through, shape ``(32, num_envs, 8)``."""
+    return np.random.default_rng(0).uniform(-1, 1, (32, num_envs, 8)).astype(np.float32)
+
+
+def raw(num_envs: int) -> Step:
+    """``mujoco.batch`` and the least that random acting and resetting take: the limit."""
+    import mujoco
+    from mujoco.batch import Batch
+
+    model = mujoco.MjModel.from_xml_path(str(files("gymnasium") / "envs/mujoco/assets/ant.xml"))
+    script, batch = actions(num_envs), Batch(model, num_envs)
+    batch.reset()
+    ctrl, qpos = batch.bind("ctrl"), batch.bind("qpos")
+    noise = np.random.default_rng(0).uniform(-0.1, 0.1, (1024, qpos.shape[-1]))
+
+    def step(index: int) -> None:
+        ctrl[:] = script[index % 32]
+        batch.step(nstep=SUBSTEPS)
+        fallen = ((qpos[:, 2] < HEALTHY_Z[0]) | (qpos[:, 2] > HEALTHY_Z[1])).nonzero()[0]
+        if len(fallen):
+            batch.reset(fallen, stage=mujoco.mjtStage.mjSTAGE_NONE)
+            qpos[fallen] += noise[(index + fallen) % 1024]
+
+    return step
+
+
+def ours(num_envs: int, contact_forces: bool = False) -> Step:
+    """Holdout, through TorchRL's ``step_and_maybe_reset``."""
+    import torch
+
+    from torchrl_mcp.envs import Holdout
+
+    torch.set_num_threads(1)
+    env = Holdout(num_envs, (0.0, 1.5 * math.pi), seed=0, contact_forces=contact_forces)
+    return stepping(env, actions(num_envs))
+
+
+def stepping(env: Any, script: np.ndarray) -> Step:
+    """Steps of a TorchRL environment."""
+    import torch
+
+    carrier, acting = env.reset(), torch.from_numpy(script).reshape(32, *env.action_spec.shape)
+
+    def step(index: int) -> None:
+        nonlocal carrier
+        _, carrier = env.step_and_maybe_reset(carrier.set("action", acting[index % 32]))
+
+    return step
+
+
+def gymnasium(num_envs: int, mode: str) -> Step:
+    """Gymnasium's vector environments; a Python process, or a loop in one, per ant."""
+    import gymnasium as gym
+
+    env = gym.make_vec("Ant-v5", num_envs, vectorization_mode=mode, **ANT)
+    env.reset(seed=0)
+    script = actions(num_envs)
+    return lambda index: env.step(script[index % 32])
+
+
+def envpool(num_envs: int) -> Step:
+    """EnvPool's C++ thread pool."""
+    import envpool as pool
+
+    off = {"use_contact_force": False, "contact_cost_weight": 0.0, "post_constraint": False}
+    env = pool.make_gymnasium("Ant-v5", num_envs=num_envs, num_threads=os.cpu_count(), seed=0, **off)
+    env.reset()
+    script = actions(num_envs).astype(np.float64)
+    return lambda index: env.step(script[index % 32])
+
+
+def torchrl_parallel(num_envs: int) -> Step:
+    """TorchRL's ParallelEnv over Gymnasium's Ant-v5; a process per ant."""
+    from torchrl.envs import GymEnv, ParallelEnv
+
+    return stepping(ParallelEnv(num_envs, partial(GymEnv, "Ant-v5", **ANT)), actions(num_envs))
+
+
+def torchrl_ant(num_envs: int) -> Step:
+    """TorchRL's AntEnv on C MuJoCo; a process per ant, and a cheaper integrator (Euler, where Ant-v5 has RK4)."""
+    from torchrl.envs import AntEnv
+
+    return stepping(AntEnv(num_envs=num_envs, backend="mujoco", seed=0), actions(num_envs))
+
+
+UNLIMITED = max(SIZES)
+PROCESSES = 2 * (os.cpu_count() or 1)
+CONTENDERS: dict[str, tuple[Callable[[int], Step], int]] = {
+    "mujoco.batch": (raw, UNLIMITED),
+    "torchrl-mcp": (ours, UNLIMITED),
+    "torchrl-mcp, contact forces": (partial(ours, contact_forces=True), UNLIMITED),
+    "EnvPool": (envpool, UNLIMITED),
+    "Gymnasium sync": (partial(gymnasium, mode="sync"), 64),
+    "Gymnasium async": (partial(gymnasium, mode="async"), 64),
+    "TorchRL ParallelEnv(GymEnv)": (torchrl_parallel, PROCESSES),
+    "TorchRL AntEnv": (torchrl_ant, PROCESSES),
+}
+"""How to set a contender up, and the most environments it is measured with."""
+
+
+def peak_memory(pid: int) -> float:
+    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
+    total = 0.0
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM"):
+                total = int(line.split()[1]) / 1024
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            total += sum(peak_memory(int(child)) for child in (task / "children").read_text().split())
+    return total
+
+
+def worker(name: str, num_envs: int) -> None:
+    """Set a contender up, then time it for as many seconds as each line of standard input says."""
+    step, index = CONTENDERS[name][0](num_envs), 0
+    until = time.perf_counter() + 0.3  # warm up, and let the first ants fall
+    while index < 20 or time.perf_counter() < until:
+        step(index)
+        index += 1
+    print(json.dumps({"ready": True}), flush=True)
+    for line in sys.stdin:
+        start, first = time.perf_counter(), index
+        while time.perf_counter() - start < float(line):
+            step(index)
+            index += 1
+        speed = (index - first) * num_envs / (time.perf_counter() - start)
+        print(json.dumps({"speed": speed, "memory": peak_memory(os.getpid())}), flush=True)
+    os._exit(0)  # closing tens of environments in order takes longer than measuring them
+
+
+def measure(sizes: dict[str, int], envpool_python: str, rounds: int, seconds: float) -> Iterator[dict[str, Any]]:
+    """Measure contenders in turns, each with its number of environments."""
+    processes = {}
+    for name, num_envs in sizes.items():
+        python = envpool_python if name == "EnvPool" else sys.executable
+        command = [python, __file__, "--worker", name, str(num_envs)]
+        pipe = subprocess.PIPE
+        processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
+    rows = {
+        name: {"contender": name, "num_envs": sizes[name], "speeds": []}
+        for name, process in processes.items()
+        if answer(process)
+    }
+    for _ in range(rounds):
+        for name, row in rows.items():
+            result = answer(processes[name], f"{seconds}\n")
+            row["speeds"].append(result["speed"])
+            row["memory"] = result["memory"]
+    for process in processes.values():
+        process.communicate()
+    yield from rows.values()
+
+
+def answer(process: subprocess.Popen, line: str = "") -> dict[str, Any]:
+    """Send a line to a worker and read its answer, the next line of JSON; empty if the worker failed."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with suppress(BrokenPipeError):
+        process.stdin.write(line)
+        process.stdin.flush()
+    return next((json.loads(line) for line in process.stdout if line.startswith("{")), {})
+
+
+def hardware() -> dict[str, str]:
+    """What the numbers were measured on and with."""
+    cpu = platform.processor()
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent)
+    packages = ["torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy"]
+    return {
+        "cpu": cpu,
+        "cpus": str(os.cpu_count()),
+        "python": platform.python_version(),
+        **{package: importlib.metadata.version(package) for package in packages},
+        "commit": commit.stdout.strip(),
+    }
+
+
+def ratio(row: dict[str, Any], other: dict[str, Any]) -> float:
+    """Median over rounds of the ratio of two contenders' speeds."""
+    return median(a / b for a, b in zip(row["speeds"], other["speeds"], strict=True))
+
+
+def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Compare with what was aimed at; the rivals with their best number of environments."""
+    for limit, mine in ((row, other) for row in rows for other in rows):
+        if (limit["contender"], mine["contender"]) != ("mujoco.batch", "torchrl-mcp"):
+            continue
+        if limit["num_envs"] != mine["num_envs"] or mine["num_envs"] < 256:
+            continue
+        yield f"torchrl-mcp at {mine['num_envs']}: {ratio(mine, limit):.3f} of mujoco.batch (aim 0.95)"
+        for family, aim in {"EnvPool": 1, "Gymnasium": 2.5, "TorchRL AntEnv": 15}.items():
+            rivals = [row for row in rows if row["contender"].startswith(family)]
+            if rivals:
+                rival = max(rivals, key=lambda row: median(row["speeds"]))
+                times = median(mine["speeds"]) / median(rival["speeds"])
+                yield f"  {times:.2f} times {rival['contender']} at {rival['num_envs']} (aim {aim})"
+
+
+def write(path: Path, rows: list[dict[str, Any]], about: dict[str, str]) -> None:
+    """Write a line per contender and size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fields = ["contender", "num_envs", "steps_per_second", "best", "of_limit", "memory_mib", "rounds"]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*fields, *about])
+        writer.writeheader()
+        for row in rows:
+            numbers = {
+                "steps_per_second": round(median(row["speeds"])),
+                "best": round(max(row["speeds"])),
+                "of_limit": f"{row['of_limit']:.3f}",
+                "memory_mib": round(row["memory"]),
+                "rounds": len(row["speeds"]),
+            }
+            writer.writerow({"contender": row["contender"], "num_envs": row["num_envs"], **numbers, **about})
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="sizes 1 and 256, fewer rounds")
+    parser.add_argument("--envpool-python", default=sys.executable, help="interpreter that has EnvPool")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--worker", nargs=2, metavar=("NAME", "NUM_ENVS"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        worker(args.worker[0], int(args.worker[1]))
+
+    rounds, seconds = (3, 0.7) if args.quick else (5, 1.0)
+    about, rows = hardware(), []
+    print(" | ".join(f"{key} {value}" for key, value in about.items()))
+    print(f"{'contender':28} {'envs':>5} {'steps/s':>9} {'best':>9} {'of limit':>9} {'memory MiB':>11}")
+    for size in (1, 256) if args.quick else SIZES:
+        sizes = {name: min(size, most) for name, (_, most) in CONTENDERS.items()}
+        measured = {(row["contender"], row["num_envs"]) for row in rows}
+        sizes = {name: count for name, count in sizes.items() if (name, count) not in measured}
+        new = list(measure(sizes, args.envpool_python, rounds, seconds))
+        limit = next(row for row in new if row["contender"] == "mujoco.batch")
+        for row in new:
+            row["of_limit"] = ratio(row, limit)
+            print(
+                f"{row['contender']:28} {row['num_envs']:5} {median(row['speeds']):9.0f} {max(row['speeds']):9.0f} "
+                f"{row['of_limit']:9.3f} {row['memory']:11.0f}",
+                flush=True,
+            )
+        rows += new
+    print("\n".join(aims(rows)))
+    write(args.output, rows, about)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+import csv
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib import _pylab_helpers
+from matplotlib.colors import same_color
+from matplotlib.image import imread
+
+from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, save_figure, write_curves
+
+RETURN = "episode/normalised_return"
+
+
+def write_run(folder, rows, columns=("iteration", "frames", "episode/count", RETURN)):
+    folder.mkdir()
+    with (folder / "metrics.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *((i, *row) for i, row in enumerate(rows, start=1))])
+    return folder
+
+
+def constant_run(folder, value, num_rows=10):
+    return write_run(folder, [(100 * i, 1, value) for i in range(1, num_rows + 1)])
+
+
+def test_a_bin_is_the_mean_over_its_episodes_not_over_its_rows(tmp_path):
+    run = write_run(tmp_path / "run", [(100, 3, 1.0), (200, 1, 5.0), (300, 0, "nan"), (400, 2, 7.0)])
+    (curve,) = learning_curves({"mcp": [run]}, num_bins=2)
+    np.testing.assert_allclose(curve.mean, [(3 * 1.0 + 1 * 5.0) / 4, 7.0])
+
+
+def test_a_quantity_that_is_no_mean_over_episodes_counts_every_row_alike(tmp_path):
+    columns = ("iteration", "frames", "episode/count", "reward")
+    run = write_run(tmp_path / "run", [(100, 3, 1.0), (200, 0, 5.0)], columns)
+    (curve,) = learning_curves({"mcp": [run]}, quantity="reward", num_bins=1)
+    np.testing.assert_allclose(curve.mean, [3.0])
+
+
+@pytest.mark.parametrize("missing", ["nan", ""], ids=["nan", "blank"])
+def test_bins_in_which_no_episode_ended_are_interpolated(tmp_path, missing):
+    run = write_run(tmp_path / "run", [(100, 1, 2.0), (200, 0, missing), (300, 0, missing), (400, 1, 8.0)])
+    (curve,) = learning_curves({"mcp": [run]}, num_bins=4)
+    np.testing.assert_allclose(curve.mean, [2.0, 4.0, 6.0, 8.0])
+    np.testing.assert_allclose(curve.frames, [50, 150, 250, 350])
+
+
+def test_nothing_is_invented_before_the_first_episode(tmp_path):
+    run = write_run(tmp_path / "run", [(100, 0, "nan"), (200, 0, "nan"), (300, 1, 1.0), (400, 1, 1.0)])
+    (curve,) = learning_curves({"mcp": [run]}, num_bins=4)
+    np.testing.assert_allclose(curve.frames, [250, 350])
+
+
+def test_seeds_give_a_mean_and_a_range(tmp_path):
+    runs = [constant_run(tmp_path / str(value), value) for value in (1.0, 2.0, 6.0)]
+    (curve,) = learning_curves({"mcp": runs}, num_bins=5)
+    assert curve.seeds == 3
+    for values, expected in ((curve.mean, 3.0), (curve.low, 1.0), (curve.high, 6.0)):
+        np.testing.assert_allclose(values, np.full(5, expected))
+
+
+def test_a_curve_ends_with_its_shortest_seed_on_a_grid_common_to_all(tmp_path):
+    short, long = constant_run(tmp_path / "short", 1.0, num_rows=5), constant_run(tmp_path / "long", 2.0)
+    both, alone = learning_curves({"both": [short, long], "alone": [long]}, num_bins=10)
+    np.testing.assert_allclose(both.frames, alone.frames[:5])
+    np.testing.assert_allclose(both.mean, 1.5)
+
+
+def test_a_row_half_written_is_left_out(tmp_path):
+    run = constant_run(tmp_path / "run", 1.0, num_rows=2)
+    with (run / "metrics.csv").open("a") as file:
+        file.write("3,30")
+    assert [row["frames"] for row in read_metrics(run)] == [100, 200]
+
+
+def test_a_run_that_has_not_begun_has_no_rows(tmp_path):
+    assert read_metrics(tmp_path) == []
+
+
+def test_a_missing_column_is_an_error_that_lists_the_columns(tmp_path):
+    with pytest.raises(ValueError, match=r"no 'speed' in metrics.csv: .*'frames'"):
+        learning_curves({"mcp": [constant_run(tmp_path / "run", 1.0)]}, quantity="speed")
+
+
+def test_a_run_without_an_episode_yet_is_an_error(tmp_path):
+    run = write_run(tmp_path / "run", [(100, 0, "nan")])
+    with pytest.raises(ValueError, match="let it run until episodes have ended"):
+        learning_curves({"mcp": [run]})
+
+
+def test_a_group_without_runs_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"\['scratch'\] name no run folder"):
+        learning_curves({"mcp": [constant_run(tmp_path / "run", 1.0)], "scratch": []})
+
+
+def test_the_written_rows_hold_the_numbers_of_the_curves(tmp_path):
+    runs = [constant_run(tmp_path / str(value), value) for value in (1.0, 2.0)]
+    curves = learning_curves({"mcp": runs, "scratch": runs[:1]}, num_bins=3)
+    write_curves(curves, tmp_path / "curves.csv")
+    with (tmp_path / "curves.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["label"] for row in rows] == ["mcp"] * 3 + ["scratch"] * 3
+    for name in ("frames", "mean", "low", "high"):
+        np.testing.assert_array_equal(
+            [float(row[name]) for row in rows], np.concatenate([getattr(curve, name) for curve in curves])
+        )
+
+
+def test_each_curve_is_one_line_of_its_own_colour_that_the_legend_names(tmp_path):
+    run = constant_run(tmp_path / "run", 0.5)
+    figure = draw_curves(learning_curves({name: [run] for name in "abcdefgh"}, num_bins=4))
+    lines = figure.axes[0].lines
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == list("abcdefgh")
+    assert len(lines) == 8
+    assert not any(same_color(a.get_color(), b.get_color()) for a in lines[:7] for b in lines[:7] if a is not b)
+    for line in lines:
+        np.testing.assert_allclose(line.get_ydata(), 0.5)
+
+
+def test_saved_figures_show_something_and_are_the_same_bytes_again(tmp_path):
+    curves = learning_curves({"mcp": [constant_run(tmp_path / "run", 0.5)]})
+    first = save_figure(draw_curves(curves), tmp_path / "a" / "curves")
+    second = save_figure(draw_curves(curves), tmp_path / "b" / "curves")
+    assert [path.name for path in first] == ["curves.png", "curves.svg"]
+    assert imread(first[0]).std() > 0.01
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_drawing_leaves_matplotlibs_global_state_alone(tmp_path):
+    before = dict(matplotlib.rcParams)
+    save_figure(draw_curves(learning_curves({"mcp": [constant_run(tmp_path / "run", 0.5)]})), tmp_path / "curves")
+    assert dict(matplotlib.rcParams) == before
+    assert not _pylab_helpers.Gcf.figs

@@ -1,0 +1,95 @@
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchrl_mcp.modules import RunningNormaliser
+
+
+@given(
+    sizes=st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    seed=st.integers(0, 2**31),
+    offset=st.floats(-100, 100),
+    spread=st.floats(0.01, 100),
+)
+def test_merged_statistics_are_those_of_all_samples_together(sizes, seed, offset, spread):
+    generator = torch.Generator().manual_seed(seed)
+    # Later batches wander off: merging has to account for the distance between the means.
+    batches = [
+        (1 + i) * offset + spread * torch.randn(size, 3, generator=generator, dtype=torch.float64)
+        for i, size in enumerate(sizes)
+    ]
+    normaliser = RunningNormaliser(3).double()
+    for batch in batches:
+        normaliser.update(batch)
+    variance, mean = torch.var_mean(torch.cat(batches), dim=0, correction=0)
+    torch.testing.assert_close(normaliser.mean, mean)
+    torch.testing.assert_close(normaliser.variance, variance, atol=1e-8, rtol=1e-6)
+    assert normaliser.count == sum(sizes)
+
+
+def test_statistics_stay_true_in_float32_over_many_updates():
+    samples = 5.0 + 0.1 * torch.randn(500, 16, 3, generator=torch.Generator().manual_seed(0))
+    normaliser = RunningNormaliser(3)
+    for batch in samples:
+        normaliser.update(batch)
+    variance, mean = torch.var_mean(samples.double(), dim=(0, 1), correction=0)
+    torch.testing.assert_close(normaliser.mean, mean.float(), rtol=1e-5, atol=0)
+    torch.testing.assert_close(normaliser.variance, variance.float(), rtol=1e-3, atol=0)
+
+
+def test_samples_come_out_standardised():
+    samples = torch.randn(4, 250, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.1, 1, 50]) + 7
+    normaliser = RunningNormaliser(3)
+    normaliser.update(samples)
+    variance, mean = torch.var_mean(normaliser(samples), dim=(0, 1), correction=0)
+    torch.testing.assert_close(mean, torch.zeros(3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(variance, torch.ones(3), atol=1e-3, rtol=0)
+
+
+def test_before_the_first_update_it_only_clips():
+    x = torch.tensor([[0.3, -4.0], [12.0, -1e6]])
+    torch.testing.assert_close(RunningNormaliser(2, clip=5.0)(x), torch.tensor([[0.3, -4.0], [5.0, -5.0]]))
+
+
+def test_a_feature_that_never_changes_stays_finite():
+    normaliser = RunningNormaliser(1, clip=10.0)
+    normaliser.update(torch.full((20, 1), 3.0))
+    assert normaliser(torch.tensor([[3.0], [4.0]])).tolist() == [[0.0], [10.0]]
+
+
+def test_updates_are_in_place():
+    normaliser = RunningNormaliser(3)
+    storages = {name: buffer.data_ptr() for name, buffer in normaliser.named_buffers()}
+    assert set(storages) == {"mean", "variance", "count"}
+    normaliser.update(torch.randn(10, 3))
+    assert {name: buffer.data_ptr() for name, buffer in normaliser.named_buffers()} == storages
+
+
+def test_it_stops_learning_at_max_count():
+    normaliser = RunningNormaliser(2, max_count=15)
+    normaliser.update(torch.randn(10, 2))
+    normaliser.update(torch.randn(10, 2))
+    before = {name: buffer.clone() for name, buffer in normaliser.named_buffers()}
+    assert before["count"] == 20
+    normaliser.update(torch.randn(10, 2) + 100)
+    for name, buffer in normaliser.named_buffers():
+        assert torch.equal(buffer, before[name]), name
+
+
+def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
+    normaliser = RunningNormaliser(2)
+    x = torch.randn(5, 2, requires_grad=True)
+    normaliser.update(x)
+    assert not list(normaliser.parameters())
+    assert not normaliser.mean.requires_grad
+    normaliser(x).sum().backward()
+    assert x.grad.ne(0).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"), [({"size": 0}, "size"), ({"size": 3, "clip": 0.0}, "clip"), ({"size": 3, "clip": -1.0}, "clip")]
+)
+def test_impossible_arguments_are_refused_by_name(arguments, name):
+    with pytest.raises(ValueError, match=name):
+        RunningNormaliser(**arguments)

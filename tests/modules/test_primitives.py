@@ -1,0 +1,102 @@
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from torchrl_mcp.modules import Primitives
+from torchrl_mcp.modules.primitives import BatchedLinear
+
+
+def count(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.mark.parametrize(
+    ("observation_dim", "action_dim", "num_primitives", "parameters"),
+    [
+        # Trunk 105*512+512 + 512*256+256 = 185600; per primitive 256*256+256 = 65792 and 256*34+34 = 8738:
+        # 185600 + 8*65792 + 8*8738
+        pytest.param(105, 17, 8, 781_840, id="biped"),
+        # Trunk 27*512+512 + 512*256+256 = 145664; per primitive 65792 and 256*16+16 = 4112:
+        # 145664 + 8*65792 + 8*4112
+        pytest.param(27, 8, 8, 704_896, id="ant"),
+        # 145664 + 65792 + 4112
+        pytest.param(27, 8, 1, 215_568, id="ant with one primitive"),
+    ],
+)
+def test_they_have_the_parameters_of_figure_3(observation_dim, action_dim, num_primitives, parameters):
+    primitives = Primitives(observation_dim, action_dim, num_primitives)
+    assert count(primitives) == parameters
+    loc, scale = primitives(torch.zeros(3, 4, observation_dim))
+    assert loc.shape == scale.shape == (3, 4, num_primitives, action_dim)
+
+
+def test_the_trunk_is_followed_by_relus():
+    assert [type(layer) for layer in Primitives(27, 8, 8).trunk] == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU]
+
+
+def test_they_compute_figure_3_one_branch_after_the_other():
+    primitives = Primitives(3, 2, 4, trunk_cells=(7, 6), branch_cells=5, initial_std=0.5, output_gain=1.0)
+    observation = torch.randn(10, 3)
+    loc, scale = primitives(observation)
+
+    features = primitives.trunk[2](primitives.trunk[0](observation).relu()).relu()
+    for k in range(4):
+        hidden = F.linear(features, primitives.branches.weight[k].T, primitives.branches.bias[k]).relu()
+        output = F.linear(hidden, primitives.output.weight[k].T, primitives.output.bias[k])
+        torch.testing.assert_close(loc[:, k], output[:, :2])
+        torch.testing.assert_close(scale[:, k], output[:, 2:].exp())
+
+
+@pytest.mark.parametrize("initial_std", [0.05, 1.0, 3.0])
+def test_every_primitive_starts_near_zero_mean_and_its_initial_std(initial_std):
+    loc, scale = Primitives(27, 8, 8, initial_std=initial_std)(torch.randn(100, 27))
+    torch.testing.assert_close(loc, torch.zeros_like(loc), atol=0.02, rtol=0)
+    torch.testing.assert_close(scale, torch.full_like(scale, initial_std), atol=0, rtol=0.02)
+
+
+def test_the_branches_differ_and_learn_apart():
+    primitives = Primitives(27, 8, 3)
+    loc, _ = primitives(torch.randn(10, 27))
+    assert not torch.equal(loc[:, 0], loc[:, 1])
+    loc[:, 1].sum().backward()
+    for layer in (primitives.branches, primitives.output):
+        moved = layer.weight.grad.flatten(1).ne(0).any(-1)
+        assert moved.tolist() == [False, True, False]
+
+
+def test_standard_deviations_stay_float32_under_autocast():
+    with torch.autocast("cpu", torch.bfloat16):
+        _, scale = Primitives(27, 8, 3)(torch.randn(10, 27))
+    assert scale.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("num_primitives", 0), ("initial_std", 0.0), ("initial_std", -0.1), ("initial_std", float("nan"))],
+)
+def test_impossible_arguments_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        Primitives(**{"observation_dim": 27, "action_dim": 8, "num_primitives": 8, name: value})
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 5)])
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_batched_linear_is_separate_linear_layers(batch, shared):
+    layers = BatchedLinear(4, 3, 2)
+    separate = [nn.Linear(3, 2) for _ in range(4)]
+    for k, linear in enumerate(separate):
+        linear.load_state_dict({"weight": layers.weight[k].T, "bias": layers.bias[k]})
+    x = torch.randn(*batch, 1 if shared else 4, 3)
+    expected = torch.stack([linear(x[..., 0 if shared else k, :]) for k, linear in enumerate(separate)], -2)
+    torch.testing.assert_close(layers(x), expected)
+
+
+def test_a_batched_linear_starts_as_torch_s_linear_layers_do():
+    torch.manual_seed(0)
+    layers = BatchedLinear(3, 64, 32)
+    torch.manual_seed(0)
+    for k in range(3):
+        linear = nn.Linear(64, 32)
+        assert torch.equal(layers.weight[k].T, linear.weight)
+        assert torch.equal(layers.bias[k], linear.bias)

@@ -1,0 +1,148 @@
+"""The command line: what it runs, what it refuses and what it says instead."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from torchrl_mcp import conf, experiment
+
+FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
+CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
+
+
+def command(name, *arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", f"torchrl_mcp.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
+    )
+
+
+def configure(*overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", overrides=list(overrides))
+
+
+def contents(folder):
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    assert command("train", *FAST, "task.pretrain.max_episode_steps=100", cwd=folder).returncode == 0
+    return folder / "runs/holdout-ant/pretrain/mcp/preset-smoke_task.pretrain.max_episode_steps-100/seed0"
+
+
+def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run):
+    root = run.parents[5]
+    assert {path.name for path in root.iterdir()} == {"runs"}
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "metrics.csv", "checkpoints"}
+    assert OmegaConf.load(run / "config.yaml").method.name == "mcp"
+
+
+def test_a_multirun_makes_a_folder_per_job(tmp_path):
+    outcome = command("train", "-m", *FAST, "mixer=multiplicative,additive", "training.total_frames=128", cwd=tmp_path)
+    assert outcome.returncode == 0, outcome.stderr
+    assert len(list(tmp_path.rglob("metrics.csv"))) == 2
+
+
+def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run, tmp_path):
+    outcome = command("evaluate", run, "--episodes", 100, "--output", tmp_path / "numbers.json", cwd=tmp_path)
+    assert outcome.returncode == 0, outcome.stderr
+    numbers = json.loads((tmp_path / "numbers.json").read_text())
+    for mode in ("deterministic", "stochastic"):
+        assert numbers[mode]["episodes"] == 100
+        assert f"normalised return {numbers[mode]['normalised_return']:.3f}" in outcome.stdout
+        # Holdout normalises by 6 per step, here over 100 steps.
+        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / 600, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        (["num_primitve=4"], "num_primitives"),
+        (["stage.gama=0.9"], "stage.gamma"),
+        (["task=holdot"], "holdout"),
+        (["method=mpc"], "mcp"),
+        (["stage=transfer"], "checkpoint=<folder>"),
+        (["stage=transfer", "checkpoint=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
+        (["exploration=weights"], "stage=transfer"),
+        (["resume=nowhere"], "nowhere holds no run"),
+        (["training.minibatch_size=100"], "multiple"),
+        (["num_primitives=0"], "num_primitives must be at least 1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_answered_with_what_to_write_instead(tmp_path, arguments, remedy):
+    outcome = command("train", *FAST, *arguments, cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert remedy in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(run):
+    before = contents(run)
+    outcome = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
+    assert outcome.returncode != 0
+    assert "resume=" in outcome.stderr
+    assert contents(run) == before
+
+
+def test_transfer_from_another_architecture_is_refused(run, tmp_path):
+    outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"checkpoint={run}", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "different method, character, task or network size" in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path):
+    copy = tmp_path / "copy"
+    for path in run.rglob("*"):
+        target = copy / path.relative_to(run)
+        if path.is_dir():
+            target.mkdir(parents=True)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    newest = max((copy / "checkpoints").iterdir())
+    damaged = bytearray(newest.read_bytes())
+    damaged[len(damaged) // 2] ^= 0xFF
+    newest.write_bytes(damaged)
+    before = contents(copy)
+    outcome = command("train", f"resume={copy}", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "damaged" in outcome.stderr
+    assert contents(copy) == before
+
+
+def test_a_finished_run_resumes_to_itself(run):
+    before = (run / "metrics.csv").read_text()
+    experiment.resume(run)
+    assert (run / "metrics.csv").read_text() == before
+
+
+@pytest.mark.parametrize(("method", "stage", "step_size"), [("mcp", "pretrain", 2e-5), ("mcp", "transfer", 5e-5)])
+def test_the_paper_preset_holds_table_5(method, stage, step_size):
+    cfg = configure("preset=paper", f"method={method}", f"stage={stage}")
+    assert cfg.num_primitives == 8
+    assert cfg.optimizer.actor["_target_"] == cfg.optimizer.critic["_target_"] == "torch.optim.SGD"
+    assert cfg.optimizer.actor.lr == step_size
+    assert cfg.optimizer.critic.lr == 1e-2
+    assert cfg.optimizer.actor.momentum == cfg.optimizer.critic.momentum == 0.9
+    assert cfg.training.frames_per_batch == 4096
+    assert cfg.training.minibatch_size == 256
+    assert cfg.objective.advantages.lmbda == 0.95
+    assert cfg.objective.advantages.gamma == {"pretrain": 0.95, "transfer": 0.99}[stage]
+    assert cfg.objective.loss.clip_epsilon == 0.02
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: "/".join(path.parts[-2:]))
+def test_every_configuration_file_is_short_and_says_what_it_is(path):
+    lines = path.read_text().splitlines()
+    assert any(line.startswith("# ") and not line.startswith("# @package") for line in lines[:2])
+    assert path.name == "train.yaml" or len(lines) <= 20

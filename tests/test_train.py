@@ -1,0 +1,82 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+
+import torchrl_mcp.conf
+from torchrl_mcp.train import suggestions
+
+CONF = Path(torchrl_mcp.conf.__file__).parent
+CHOICES = [f"{file.parent.name}={file.stem}" for file in sorted(CONF.glob("*/*.yaml"))]
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_of_every_group_composes(choice):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        compose("train", [choice])
+
+
+@pytest.mark.parametrize(
+    ("argument", "meant"),
+    [
+        ("num_primitivs=4", "num_primitives"),
+        ("trainig.num_envs=64", "training.num_envs"),
+        ("mixr=additive", "mixer"),
+        ("objective.loss.clip_epsilom=0.1", "objective.loss.clip_epsilon"),
+        ("hydra.swep.dir=runs", "hydra.sweep.dir"),
+    ],
+)
+def test_an_unknown_setting_is_answered_with_the_nearest_that_exist(argument, meant):
+    (line,) = suggestions([argument])
+    key, _ = argument.split("=")
+    assert line.startswith(f"'{key}' is no setting")
+    assert line.split("the nearest are: ")[1].split(", ")[0] == meant
+
+
+def test_a_setting_like_no_other_is_answered_with_the_groups():
+    (line,) = suggestions(["qqqqqqqq=1"])
+    for group in ("method", "mixer", "task", "preset"):
+        assert group in line
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["method=scratch", "preset=smoke", "seed=3", "training.num_envs=8", "stage.gamma=0.9"],
+        ["mixer=additive,multiplicative", "seed=range(3)", "--multirun"],
+        ["hydra.run.dir=out"],
+        ["+note=new"],
+        ["~logger"],
+        pytest.param(["method=scratch", "parts.policy.std=0.2"], id="a setting of another method"),
+        pytest.param(["preset=paper", "step_size.mcp.pretrain=1e-4"], id="a setting of another preset"),
+    ],
+)
+def test_settings_that_exist_are_left_alone(arguments):
+    assert suggestions(arguments) == []
+
+
+def test_only_the_unknown_among_several_are_answered():
+    lines = suggestions(["method=scratch", "parts.polcy.std=0.2", "seed=1", "sead=2"])
+    assert [line.split("'")[1] for line in lines] == ["parts.polcy.std", "sead"]
+    assert "parts.policy.std" in lines[0]
+
+
+@pytest.mark.parametrize("arguments", [["mixer"], ["a=[1,"], ["method=no_such", "sead=2"]])
+def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
+    assert suggestions(arguments) == []
+
+
+def test_the_command_line_says_which_setting_was_perhaps_meant(tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "torchrl_mcp.train", "num_primitivs=4", f"run_dir={tmp_path / 'run'}"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert run.returncode == 1
+    assert "'num_primitivs' is no setting of this method; the nearest are: num_primitives" in run.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,53 @@
+"""How far a run is, and where its time goes."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import nn
+
+SECTIONS = ("physics", "forward", "update")
+"""Where the time of training should go; the rest is overhead."""
+
+
+@dataclass
+class Progress:
+    """How far a run is; part of its checkpoints."""
+
+    iteration: int = 0
+    frames: int = 0
+    seconds: float = 0.0
+
+    def state_dict(self) -> dict[str, float]:
+        """Return the counters."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the counters."""
+        vars(self).update(state)
+
+
+@dataclass
+class Stopwatch:
+    """Wall-clock seconds by section."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, section: str) -> Iterator[None]:
+        """Time a block."""
+        start = time.perf_counter()
+        yield
+        self.add(section, time.perf_counter() - start)
+
+    def add(self, section: str, seconds: float) -> None:
+        """Add to a section."""
+        self.seconds[section] = self.seconds.get(section, 0.0) + seconds
+
+    def watch(self, section: str, module: nn.Module) -> None:
+        """Time every forward pass of ``module``."""
+        starts: list[float] = []
+        module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
+        module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))
