@@ -11,23 +11,9 @@ import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
-# The parts of mjSTATE_INTEGRATION, by the names of their MjData fields: all that the next step depends on.
-STATE_FIELDS = (
-    "time",
-    "qpos",
-    "qvel",
-    "act",
-    "history",
-    "qacc_warmstart",
-    "ctrl",
-    "qfrc_applied",
-    "xfrc_applied",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "userdata",
-    "plugin_state",
-)
+# The parts of mjSTATE_INTEGRATION in order, by the names of their MjData fields: all that the next step depends on.
+CHANGING_FIELDS = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl")
+GIVEN_FIELDS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata", "plugin_state")
 
 LARGEST = mujoco.mjMAXVAL
 """MuJoCo's own limit (1e10): a larger state has diverged."""
@@ -68,12 +54,12 @@ class Simulation:
         """Wall-clock seconds spent inside MuJoCo so far."""
         self._batch = Batch(self.model, num_envs, num_threads, persistent)
         self._data = mujoco.MjData(self.model)
-        self._rows = self._batch.state
-        self._initial, self._before = self._rows[0].copy(), np.empty_like(self._rows)
-        fields = {name: self._batch.bind(name) for name in STATE_FIELDS}
+        fields = {name: self._batch.bind(name) for name in (*CHANGING_FIELDS, *GIVEN_FIELDS)}
         self._fields = {name: field for name, field in fields.items() if field.size}
         self.state = {name: torch.from_numpy(field) for name, field in self._fields.items()}
         """Live views of the state fields that the model has, each ``(N, ...)``, float64. Writing sets the state."""
+        self._rows = self._batch.state[:, : sum(fields[name][0].size for name in CHANGING_FIELDS)]
+        self._initial, self._before = self._batch.state[0].copy(), np.empty_like(self._rows)
         self.outputs = {name: _view(self._batch.bind(name)) for name in outputs}
         """Live views of the outputs, each ``(N, ...)``: results of the last call, not to be written to."""
 
@@ -108,7 +94,7 @@ class Simulation:
             fields: Values of state fields, each ``(n, ...)``; the other fields take the model's defaults.
         """
         rows = ids.numpy()
-        self._rows[rows] = self._initial
+        self._batch.state[rows] = self._initial
         for name, value in fields.items():
             self._fields[name][rows] = value.numpy()
         if len(failed := self._run(self._batch.forward, rows)):

@@ -19,7 +19,7 @@ from torchrl_mcp.actors import (
 )
 from torchrl_mcp.critics import value_critic
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
-from torchrl_mcp.modules import GaussianPolicy, Gating, Primitives
+from torchrl_mcp.modules import Gating, GaussianPolicy, Primitives
 from torchrl_mcp.objectives import BoundedClipPPOLoss
 
 S, G, A, K = 6, 2, 3, 4
@@ -42,6 +42,11 @@ def composite(mixer="multiplicative", activation="sigmoid", num_primitives=K, ga
         distribution_class=MIXERS[mixer],
         **{"initial_std": 0.3, **kwargs},
     )
+
+
+def configure(*overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", list(overrides))
 
 
 def make(name):
@@ -82,12 +87,25 @@ def sample(actor, *batch):
 @pytest.mark.parametrize("num_primitives", [1, 4, 8, 32])
 @pytest.mark.parametrize("mixer", MIXERS)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_the_composite_starts_at_the_configured_standard_deviation(num_primitives, mixer, activation):
+def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives, mixer, activation):
     heads = {"gate_activation": ACTIVATIONS[activation], "distribution_class": MIXERS[mixer]}
     for gain, tolerance in ((0.0, 1e-5), (0.01, 0.02)):
         parts = composite(mixer, activation, num_primitives, gain=gain, initial_std=0.17)
         stddev = composite_actor(parts, **heads).trained.get_dist(states(50)).stddev
         torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=tolerance)
+
+
+@pytest.mark.parametrize("num_primitives", [1, 4, 8, 32])
+@pytest.mark.parametrize("mixer", MIXERS)
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_for(num_primitives, mixer, activation):
+    cfg = configure(f"mixer={mixer}", f"gating={activation}", f"num_primitives={num_primitives}")
+    torch.manual_seed(0)
+    parts, td = instantiate(cfg.parts)(S, G, A), states(200)
+    parts["observation_normaliser"].update(td["observation"])
+    stddev = instantiate(cfg.actor)(parts).trained.get_dist(td).stddev
+    # Random last layers spread the deviations of states and actions around it.
+    assert stddev.mean().item() == pytest.approx(cfg.primitives.initial_std, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -99,8 +117,7 @@ def test_the_composite_starts_at_the_configured_standard_deviation(num_primitive
     ],
 )
 def test_the_configuration_builds_figure_3_for_the_biped(method, parameters):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [f"method={method}"])
+    cfg = configure(f"method={method}")
     parts = instantiate(cfg.parts)(105, 2, 17)
     instantiate(cfg.critic)(parts, 105, 2)
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}

@@ -1,4 +1,5 @@
 import hashlib
+import io
 import json
 import pickle
 import random
@@ -142,12 +143,11 @@ def flip(data, where):
 
 
 def archive(**members):
-    file = tempfile.TemporaryFile()
+    file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as zipped:
         for name, content in members.items():
             zipped.writestr(name, content)
-    file.seek(0)
-    return file.read()
+    return file.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,9 @@ def archive(**members):
         *(pytest.param(lambda data, s=s: truncate(data, s), id=f"cut to {s}") for s in (0.01, 0.5, 0.99)),
         pytest.param(lambda data: data[:-1], id="last byte lost"),
         *(pytest.param(lambda data, w=w: flip(data, w), id=f"bit flipped in {w}") for w in ("header", "tensor", "end")),
-        pytest.param(lambda data: b"PK\x03\x04" + random.Random(0).randbytes(2000), id="noise that begins like an archive"),
+        pytest.param(
+            lambda data: b"PK\x03\x04" + random.Random(0).randbytes(2000), id="noise that begins like an archive"
+        ),
         pytest.param(lambda data: b"iteration,loss\n1,0.5\n", id="a text"),
         pytest.param(lambda data: archive(notes=b"hello"), id="another archive"),
         pytest.param(lambda data: archive(**{"manifest.json": b"[]"}), id="another manifest"),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import subprocess
 import sys
 import time
@@ -32,7 +33,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "my demo"
     command = [sys.executable, "-m", "torchrl_mcp.demo", "--smoke", "--output", folder]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not (folder / "transfer" / "config.yaml").exists():
         assert killed.poll() is None
         assert time.monotonic() < deadline
@@ -49,8 +50,8 @@ def contents(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
-def runs(folder):
-    return {name: demo.configuration(folder / name, [*overrides, *SMOKE]) for name, overrides in demo.RUNS.items()}
+def configurations(folder, *overrides):
+    return {name: demo.configuration(folder / name, [*own, *overrides]) for name, own in demo.RUNS.items()}
 
 
 def test_it_was_killed_after_pretraining_and_before_the_end(finished):
@@ -92,9 +93,8 @@ def test_the_last_words_are_the_table_and_where_to_find_it(finished):
 
 @pytest.mark.parametrize("name", ["before", "after", "scratch_early", "scratch"])
 def test_the_table_holds_the_numbers_of_an_evaluation_on_the_held_out_directions(finished, name):
-    cfg = runs(finished.folder)["transfer"]
-    policy = demo.policies(finished.folder, runs(finished.folder))[name]
-    expected = experiment.evaluate_run(policy.path, episodes=8, seed=12345, directions=cfg.task.directions.transfer)
+    policy = demo.policies(finished.folder, configurations(finished.folder, *SMOKE))[name]
+    expected = experiment.evaluate_run(policy.path, episodes=8, seed=12345, directions=[1.5 * math.pi, 2 * math.pi])
     found = json.loads((finished.folder / "results.json").read_text())[name]
     assert {mode: found[mode] for mode in expected} == expected
     rows = [line for line in (finished.folder / "results.md").read_text().splitlines() if policy.label in line]
@@ -108,15 +108,29 @@ def test_an_existing_folder_with_other_settings_is_refused(finished):
 
 
 def test_the_full_budget_keeps_a_checkpoint_of_scratch_after_as_many_steps_as_transfer(tmp_path):
-    full = {n: demo.configuration(tmp_path / n, [*o, "preset=demo"]) for n, o in demo.RUNS.items()}
-    policies, cfg = demo.policies(tmp_path, full), full["scratch"]
-    between = cfg.checkpoint_interval * cfg.training.frames_per_batch
-    assert policies["scratch_early"].steps % between == 0
-    assert (policies["scratch"].steps - policies["scratch_early"].steps) / between < cfg.keep_checkpoints
+    runs = configurations(tmp_path, "preset=demo")
+    demo.require_early_checkpoint(runs)
+    policies, cfg = demo.policies(tmp_path, runs), runs["scratch"]
+    later = policies["scratch"].steps - policies["scratch_early"].steps
+    assert later / (cfg.checkpoint_interval * cfg.training.frames_per_batch) < cfg.keep_checkpoints
+
+
+def test_a_budget_that_leaves_scratch_without_that_checkpoint_is_refused_before_training(tmp_path):
+    runs = configurations(tmp_path, *SMOKE, "training.total_frames=1024", "checkpoint_interval=3")
+    runs["transfer"].training.total_frames = 512
+    with pytest.raises(ValueError, match=r"ends after 512 steps, .* only one every 384"):
+        demo.require_early_checkpoint(runs)
 
 
 def test_the_full_budget_gives_scratch_as_many_steps_as_pretraining_and_transfer_together(tmp_path):
-    full = {n: demo.configuration(tmp_path / n, [*o, "preset=demo"]) for n, o in demo.RUNS.items()}
-    policies = demo.policies(tmp_path, full)
+    policies = demo.policies(tmp_path, configurations(tmp_path, "preset=demo"))
     assert policies["scratch"].steps == policies["after"].steps + policies["after"].pretraining_steps
     assert policies["scratch_early"].steps == policies["after"].steps
+
+
+@pytest.mark.parametrize("override", ["nonsense=1", "seed", "preset=unknown"])
+def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, override):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-demo", "--output", str(tmp_path / "demo"), override])
+    with pytest.raises(SystemExit, match=override.partition("=")[0]):
+        demo.main()
+    assert not (tmp_path / "demo").exists()

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+
 from torchrl_mcp import conf, experiment
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -100,19 +102,16 @@ def test_transfer_from_another_architecture_is_refused(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path):
+def flip_a_byte(data):
+    return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 0xFF]) + data[len(data) // 2 + 1 :]
+
+
+@pytest.mark.parametrize("damage", [flip_a_byte, lambda data: data[:1000], lambda data: b"something else"])
+def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path, damage):
     copy = tmp_path / "copy"
-    for path in run.rglob("*"):
-        target = copy / path.relative_to(run)
-        if path.is_dir():
-            target.mkdir(parents=True)
-        else:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(path.read_bytes())
+    shutil.copytree(run, copy)
     newest = max((copy / "checkpoints").iterdir())
-    damaged = bytearray(newest.read_bytes())
-    damaged[len(damaged) // 2] ^= 0xFF
-    newest.write_bytes(damaged)
+    newest.write_bytes(damage(newest.read_bytes()))
     before = contents(copy)
     outcome = command("train", f"resume={copy}", cwd=tmp_path)
     assert outcome.returncode != 0

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -67,16 +65,3 @@ def test_only_the_unknown_among_several_are_answered():
 @pytest.mark.parametrize("arguments", [["mixer"], ["a=[1,"], ["method=no_such", "sead=2"]])
 def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
     assert suggestions(arguments) == []
-
-
-def test_the_command_line_says_which_setting_was_perhaps_meant(tmp_path):
-    run = subprocess.run(
-        [sys.executable, "-m", "torchrl_mcp.train", "num_primitivs=4", f"run_dir={tmp_path / 'run'}"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert run.returncode == 1
-    assert "'num_primitivs' is no setting of this method; the nearest are: num_primitives" in run.stderr
-    assert list(tmp_path.iterdir()) == []

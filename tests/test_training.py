@@ -10,6 +10,7 @@ import time
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+
 from torchrl_mcp import checkpoint, experiment
 
 TIMES = ("seconds", "time/")
@@ -38,7 +39,7 @@ def pretrained(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "overrides",
-    [[], ["method=scratch"], ["mixer=additive"], ["gating=softmax", "num_primitives=3"], ["autocast=false"]],
+    [[], ["method=scratch"], ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"]],
     ids=" ".join,
 )
 def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path, overrides):
@@ -80,7 +81,9 @@ def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path
     before, after = final_parts(pretrained), final_parts(folder)
     for name in before:
         kept = name.startswith(("primitives", "observation_normaliser"))
-        constant = name.endswith("count") and "critic" not in name and "goal" in name  # the same number of goals was seen
+        constant = (
+            name.endswith("count") and "critic" not in name and "goal" in name
+        )  # the same number of goals was seen
         assert torch.equal(before[name], after[name]) == (kept or constant), name
 
 
@@ -99,21 +102,24 @@ def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, 
     assert not torch.equal(before["primitives.output.weight"], after["primitives.output.weight"])
 
 
-def test_collection_and_loss_agree_before_the_first_update(tmp_path):
-    for settings in (["autocast=true"], ["autocast=false"], ["mixer=additive"], ["method=scratch"]):
-        folder = tmp_path / "_".join(settings)
-        cfg = configure(folder, *settings, "training.num_epochs=1", "training.minibatch_size=128")
-        experiment.train(cfg)
-        first = rows(folder)[0]
-        assert float(first["loss/clip_fraction"]) == 0.0
-        assert float(first["loss/max_ratio"]) == 1.0
-        assert float(first["loss/kl"]) == 0.0
+@pytest.mark.parametrize(("autocast", "tolerance"), [("false", 1e-5), ("true", 2e-3)])
+@pytest.mark.parametrize("method", ["method=mcp", "mixer=additive", "method=scratch"])
+def test_collection_and_loss_agree_before_the_first_update(tmp_path, method, autocast, tolerance):
+    # One gradient step per iteration: its report is from before the step. Matrix products of other batch sizes round
+    # differently, in bfloat16 more than in float32.
+    folder = tmp_path / "run"
+    one_step = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=128"]
+    experiment.train(configure(folder, method, f"autocast={autocast}", *one_step))
+    (first,) = rows(folder)
+    assert float(first["loss/clip_fraction"]) == 0.0
+    assert abs(float(first["loss/max_ratio"]) - 1.0) <= tolerance
+    assert abs(float(first["loss/kl"])) <= tolerance
 
 
 def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_good_checkpoint(tmp_path):
     folder = tmp_path / "run"
     cfg = configure(folder, "checkpoint_interval=1", "optimizer.critic.lr=1e30", "objective.max_grad_norm=1e30")
-    with pytest.raises(FloatingPointError, match="loss_critic|critic_grad_norm"):
+    with pytest.raises(FloatingPointError, match=r"loss_critic|critic_grad_norm"):
         experiment.train(cfg)
     for value in final_parts(folder).values():
         assert value.isfinite().all()

@@ -75,8 +75,9 @@ def find(path: Path) -> Path:
     """
     if path.is_file():
         return path
-    if path.is_dir() and (latest := rotation(path, keep_last=1).latest()) is not None:
-        return latest
+    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
+    if saved := sorted((path / FOLDER).glob("checkpoint-*.torchrl")):
+        return saved[-1]
     raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
 
 

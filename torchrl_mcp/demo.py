@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_module
+from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
@@ -75,7 +76,7 @@ def main() -> None:
     preset = "demo_smoke" if arguments.smoke else "demo"
     try:
         run(arguments.output, [f"preset={preset}", *arguments.overrides])
-    except ValueError as error:
+    except (HydraException, ValueError) as error:
         sys.exit(f"torchrl-mcp-demo: {error}")
     except KeyboardInterrupt:
         sys.exit("\ntorchrl-mcp-demo: interrupted; call it again to go on from here")
@@ -85,11 +86,12 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     """Train, evaluate and report in ``folder``, save what it holds already.
 
     Raises:
-        ValueError: If the folder holds a demo with other settings, or a process fails.
+        ValueError: If the settings contradict each other or those of the folder, or a process fails.
     """
     began = time.monotonic()
     runs = {name: configuration(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
     runs["transfer"].checkpoint = runs["pretrain"].run_dir
+    require_early_checkpoint(runs)
     print(f"Working in {folder}. Interrupt it when you like: called again, it goes on from there.", flush=True)
     show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
     print("\n" + report(folder, runs))
@@ -110,6 +112,17 @@ def configuration(folder: Path, overrides: Sequence[str]) -> DictConfig:
     if saved.exists() and _settings(OmegaConf.load(saved)) != _settings(cfg):
         raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
     return cfg
+
+
+def require_early_checkpoint(runs: Runs) -> None:
+    """Check that scratch writes a checkpoint after as many steps as transfer takes."""
+    steps, scratch = _steps(runs["transfer"]), runs["scratch"]
+    between = scratch.checkpoint_interval * scratch.training.frames_per_batch
+    if steps % between and steps != _steps(scratch):
+        raise ValueError(
+            f"transfer ends after {steps} steps, and scratch has no checkpoint there to compare with, only one every "
+            f"{between}: make demo.frames.mcp.transfer a multiple of that, or checkpoint_interval smaller"
+        )
 
 
 def policies(folder: Path, runs: Runs) -> dict[str, Policy]:
@@ -208,7 +221,8 @@ def report(folder: Path, runs: Runs) -> str:
     low, high = (math.degrees(angle) for angle in cfg.task.directions.transfer)
     table = _table(lines, results) + (
         f"\n\nNormalised return on directions from {low:.0f} to {high:.0f} degrees: mean of {cfg.demo.episodes} "
-        f"episodes and its 95 % interval. Seed {cfg.seed}, torchrl-mcp {__version__}."
+        "episodes and its 95 % interval. Steps are those of training on these directions, steps before those of "
+        f"pre-training on the others. Seed {cfg.seed}, torchrl-mcp {__version__}."
     )
     details = {
         name: {"label": line.label, "steps": line.steps, "pretraining_steps": line.pretraining_steps, **results[name]}
@@ -216,7 +230,8 @@ def report(folder: Path, runs: Runs) -> str:
     }
     (folder / "results.md").write_text(table + "\n")
     (folder / "results.json").write_text(json.dumps(details, indent=2) + "\n")
-    curves = analysis.learning_curves({"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]})
+    groups = {"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]}
+    curves = analysis.learning_curves(groups, num_bins=20)
     analysis.write_curves(curves, folder / "learning_curves.csv")
     figure = analysis.draw_curves(curves, xlabel="environment steps on the held-out directions")
     analysis.save_figure(figure, folder / "learning_curves")

@@ -88,7 +88,8 @@ def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name"), [({"size": 0}, "size"), ({"size": 3, "clip": 0.0}, "clip"), ({"size": 3, "clip": -1.0}, "clip")]
+    ("arguments", "name"),
+    [({"size": 0}, "size"), ({"size": 3, "clip": 0.0}, "clip"), ({"size": 3, "clip": -1.0}, "clip")],
 )
 def test_impossible_arguments_are_refused_by_name(arguments, name):
     with pytest.raises(ValueError, match=name):

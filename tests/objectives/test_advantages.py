@@ -35,7 +35,10 @@ def trajectories(outcomes, seed):
     generator = torch.Generator().manual_seed(seed)
     outcomes = torch.tensor(outcomes)
     shape = tuple(outcomes.shape)
-    state = {"observation": torch.randn(*shape, 3, generator=generator), "goal": torch.randn(*shape, 2, generator=generator)}
+    state = {
+        "observation": torch.randn(*shape, 3, generator=generator),
+        "goal": torch.randn(*shape, 2, generator=generator),
+    }
     following = {}
     for key, value in state.items():
         # The next state is the following sample, but an end's is its own: the following sample begins an episode.
@@ -80,7 +83,9 @@ def normalised(rows, clip):
 
 outcome = st.sampled_from([CONTINUES] * 5 + [TERMINATED, TRUNCATED, BOTH])
 tables = st.tuples(st.integers(1, 3), st.integers(2, 9)).flatmap(
-    lambda shape: st.lists(st.lists(outcome, min_size=shape[1], max_size=shape[1]), min_size=shape[0], max_size=shape[0])
+    lambda shape: st.lists(
+        st.lists(outcome, min_size=shape[1], max_size=shape[1]), min_size=shape[0], max_size=shape[0]
+    )
 )
 
 
@@ -162,7 +167,9 @@ def test_advantages_have_zero_mean_and_unit_variance_until_clipped():
 def test_a_batch_without_any_advantage_stays_finite():
     batch = trajectories([[TERMINATED] * 5] * 2, seed=0)
     batch["next", "reward"].zero_()
-    silent = TensorDictModule(lambda observation, goal: observation[..., :1] * 0, ["observation", "goal"], ["state_value"])
+    silent = TensorDictModule(
+        lambda observation, goal: observation[..., :1] * 0, ["observation", "goal"], ["state_value"]
+    )
     Advantages(silent, gamma=0.95, lmbda=0.95, clip=4.0)(batch)
     assert batch["advantage"].eq(0).all()
 

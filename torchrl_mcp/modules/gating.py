@@ -37,7 +37,7 @@ class Gating(nn.Module):
         state_cells: Sequence[int] = (512, 256),
         goal_cells: Sequence[int] = (512, 256),
         joint_cells: Sequence[int] = (256,),
-        output_gain: float = 0.01,
+        output_gain: float = 1.0,
     ) -> None:
         super().__init__()
         self.state_encoder = relu_mlp(observation_dim, state_cells)

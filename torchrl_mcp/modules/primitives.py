@@ -22,7 +22,7 @@ class Primitives(nn.Module):
         trunk_cells: Hidden units shared by all primitives.
         branch_cells: Hidden units of each primitive's own layer.
         initial_std: Standard deviation of every primitive before training, in action units.
-        output_gain: Factor on the initial weights of the output layers.
+        output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
 
     Raises:
         ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
@@ -40,7 +40,7 @@ class Primitives(nn.Module):
         trunk_cells: Sequence[int] = (512, 256),
         branch_cells: int = 256,
         initial_std: float = 1.0,
-        output_gain: float = 0.01,
+        output_gain: float = 1.0,
     ) -> None:
         super().__init__()
         if num_primitives < 1:

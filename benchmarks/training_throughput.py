@@ -1,0 +1,314 @@
+"""Training samples per second, end to end on the CPU: ours beside Stable-Baselines3's PPO.
+
+    pip install -c constraints.txt stable-baselines3    # adds this one package, changes no other
+    python benchmarks/training_throughput.py            # minutes, writes results/training_throughput.csv
+    python benchmarks/training_throughput.py --quick    # seconds, writes nothing unless given --output
+
+Both train Gymnasium's Ant-v5 without contact forces, and everything that an iteration does counts: acting, physics,
+resets, advantages, gradient steps, metrics. Alike are the policy and value networks (1024-512, ReLU, separate), the
+initial policy's spread, frames per iteration, minibatch and epochs (those of preset=fast), the step size and the number
+of threads. The rest is what each does by default: ours sees a goal, standardises its inputs and takes fused Adam steps.
+
+A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` measures others than the default.
+Each has a process of its own, in which the first iteration is not counted. They then take turns, one iteration each per
+round, while the others wait, so that a busy machine slows all of them. A speed is the median over rounds, a ratio the
+median of the rounds'.
+"""
+
+import argparse
+import csv
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from datetime import date
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from omegaconf import DictConfig
+
+SCRIPT = Path(__file__).resolve()
+RESULTS = SCRIPT.parent / "results" / "training_throughput.csv"
+CONTENDERS = ["ours-scratch-bf16", "ours-scratch-fp32", "ours-mcp-bf16", "sb3-dummy-128", "sb3-subproc-16"]
+QUICK_CONTENDERS = ["ours-scratch-bf16", "sb3-dummy-16"]
+QUICK_TRAINING = {"num_envs": 16, "frames_per_batch": 256, "minibatch_size": 128, "num_epochs": 1}
+STEP_SIZE = 3e-4
+SECTIONS = ("physics", "forward", "update", "other")
+AIM = 2.0
+
+Iteration = dict[str, Any]
+"""What a worker reports: ``seconds``, peak ``memory`` in MiB, and ``shares`` of the seconds by section."""
+
+
+def configuration(*overrides: str) -> DictConfig:
+    """Return the configuration of a training run."""
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+class Turns:
+    """The worker's side: an iteration begins at a line of standard input and ends with a line of JSON."""
+
+    def begin(self) -> None:
+        """Wait for the word; without one, all is measured."""
+        if not sys.stdin.readline():
+            raise SystemExit
+        self.start = time.perf_counter()
+
+    def end(self, shares: dict[str, float]) -> None:
+        """Report the iteration, with the shares of its sections."""
+        seconds = time.perf_counter() - self.start
+        print(json.dumps({"seconds": seconds, "memory": peak_memory(os.getpid()), "shares": shares}), flush=True)
+
+    def log_metrics(self, metrics: dict[str, float], step: int) -> None:
+        """As a logger of ours, which is called when an iteration is complete."""
+        self.end({section: metrics[f"time/{section}"] for section in SECTIONS})
+        self.begin()
+
+
+def ours(method: str, precision: str, training: dict[str, int]) -> None:
+    """Train by the library's own configuration and loop."""
+    from torchrl_mcp import experiment
+
+    settings = {
+        "method": method,
+        "task": "holdout",
+        "task.directions.pretrain": [0, 0],  # +x, where the reward is that of Ant-v5
+        "task.pretrain.max_episode_steps": 1000,
+        "task.pretrain.contact_forces": False,
+        "autocast": precision == "bf16",
+        "optimizer.actor.lr": STEP_SIZE,
+        "optimizer.critic.lr": STEP_SIZE,
+        "optimizer.schedule": "null",
+        "training.total_frames": 10**12,  # until standard input ends
+        "checkpoint_interval": 10**9,
+        "progress_bar": False,
+        "run_dir": ".",
+        **{f"training.{key}": value for key, value in training.items()},
+    }
+    cfg = configuration(*(f"{key}={value}" for key, value in settings.items()))
+    env = experiment.make_env(cfg, num_envs=cfg.training.num_envs, seed=cfg.seed)
+    trainer = experiment.make_trainer(cfg, experiment.make_agent(cfg, env), env, Path(cfg.run_dir))
+    turns = Turns()
+    trainer.record.loggers = [turns]
+    turns.begin()
+    trainer.run()
+
+
+def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
+    """Train by Stable-Baselines3 with its ``DummyVecEnv`` (a loop) or ``SubprocVecEnv`` (a process per ant)."""
+    from math import log
+
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+    from torch import nn
+
+    class Callback(BaseCallback):
+        turns, collected = Turns(), 0.0
+
+        def _on_rollout_start(self) -> None:
+            if self.num_timesteps:
+                now = time.perf_counter()
+                self.turns.end({"update": (now - self.collected) / (now - self.turns.start)})
+            self.turns.begin()
+
+        def _on_rollout_end(self) -> None:
+            self.collected = time.perf_counter()
+
+        def _on_step(self) -> bool:
+            return True
+
+    classes: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+    env = make_vec_env(
+        "Ant-v5",
+        int(num_envs),
+        seed=0,
+        env_kwargs={"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0},
+        vec_env_cls=classes[vec_env],
+    )
+    cells, std = [1024, 512], configuration("method=scratch").parts.policy.std
+    ppo = PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=STEP_SIZE,
+        n_steps=training["frames_per_batch"] // int(num_envs),
+        batch_size=training["minibatch_size"],
+        n_epochs=training["num_epochs"],
+        policy_kwargs={"net_arch": {"pi": cells, "vf": cells}, "activation_fn": nn.ReLU, "log_std_init": log(std)},
+        seed=0,
+        device="cpu",
+    )
+    ppo.learn(10**12, callback=Callback())
+
+
+def worker(name: str, training: dict[str, int], threads: int) -> None:
+    """Train as the contender of that name."""
+    import torch
+
+    torch.set_num_threads(threads)
+    family, kind, detail = name.split("-")
+    {"ours": ours, "sb3": sb3}[family](kind, detail, training)
+
+
+def peak_memory(pid: int) -> float:
+    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
+    total = 0.0
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM"):
+                total = int(line.split()[1]) / 1024
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            total += sum(peak_memory(int(child)) for child in (task / "children").read_text().split())
+    return total
+
+
+def iterate(name: str, process: subprocess.Popen) -> Iteration:
+    """Let the contender of that name take one iteration, and return what it reports."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with suppress(BrokenPipeError):
+        process.stdin.write("\n")
+        process.stdin.flush()
+    for line in process.stdout:
+        if line.startswith("{"):
+            return json.loads(line)
+    raise SystemExit(f"{name} failed, see above")
+
+
+def measure(contenders: list[str], training: dict[str, int], threads: int, rounds: int) -> dict[str, list[Iteration]]:
+    """Return every contender's iterations, one per round."""
+    processes: dict[str, subprocess.Popen] = {}
+    pipe, settings = subprocess.PIPE, ["--threads", str(threads), "--worker", json.dumps(training)]
+    with TemporaryDirectory() as folder:
+        try:
+            for name in contenders:
+                command, home = [sys.executable, str(SCRIPT), *settings, name], Path(folder, name)
+                home.mkdir()
+                processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=home)
+                iterate(name, processes[name])
+            iterations: dict[str, list[Iteration]] = {name: [] for name in contenders}
+            for _ in range(rounds):
+                for name, process in processes.items():
+                    iterations[name].append(iterate(name, process))
+        finally:
+            for process in processes.values():
+                process.communicate()
+    return iterations
+
+
+def summaries(iterations: dict[str, list[Iteration]], frames: int) -> list[dict[str, Any]]:
+    """Return a row of numbers per contender."""
+    seconds = {name: [entry["seconds"] for entry in entries] for name, entries in iterations.items()}
+    best = min((name for name in seconds if name.startswith("sb3")), key=lambda name: median(seconds[name]), default="")
+    rows = []
+    for name, entries in iterations.items():
+        ratios = [rival / own for own, rival in zip(seconds[name], seconds.get(best, []), strict=False)]
+        shares = [entry["shares"] for entry in entries]
+        rows.append(
+            {
+                "contender": name,
+                "samples_per_second": round(frames / median(seconds[name])),
+                "slowest": round(frames / max(seconds[name])),
+                "fastest": round(frames / min(seconds[name])),
+                "of_best_sb3": round(median(ratios), 3) if ratios else "",
+                **{key: round(median(s[key] for s in shares), 3) if key in shares[0] else "" for key in SECTIONS},
+                "memory_mib": round(max(entry["memory"] for entry in entries)),
+            }
+        )
+    return rows
+
+
+def about() -> dict[str, str | int]:
+    """Return what the numbers were measured on, with what, and when."""
+    cpu = platform.processor()
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    commit = ""
+    with suppress(OSError):
+        command = ["git", "rev-parse", "--short", "HEAD"]
+        commit = subprocess.run(command, capture_output=True, text=True, cwd=SCRIPT.parent).stdout.strip()
+    packages = ["torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy", "stable-baselines3"]
+    versions = {}
+    for package in packages:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return {
+        "commit": commit,
+        "date": date.today().isoformat(),
+        "cpu": cpu,
+        "cores": os.cpu_count() or 1,
+        "python": platform.python_version(),
+        **versions,
+    }
+
+
+def available(contenders: list[str]) -> list[str]:
+    """Leave out what is not installed, and say so."""
+    if importlib.util.find_spec("stable_baselines3"):
+        return contenders
+    for name in contenders:
+        if name.startswith("sb3"):
+            print(f"{name}: skipped, for stable-baselines3 is not installed")
+    return [name for name in contenders if not name.startswith("sb3")]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return rows of one set of keys as text, a line each."""
+    lines = [list(rows[0]), *([str(value) if value != "" else "-" for value in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+
+
+def write(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows of one set of keys as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small batches, fewer contenders and rounds")
+    parser.add_argument("--contenders", nargs="+", metavar="NAME")
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads of every contender")
+    parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
+    parser.add_argument("--worker", nargs=2, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        worker(args.worker[1], json.loads(args.worker[0]), args.threads)
+        return
+
+    preset = configuration("preset=fast").training
+    training = QUICK_TRAINING if args.quick else {key: preset[key] for key in QUICK_TRAINING}
+    contenders = available(args.contenders or (QUICK_CONTENDERS if args.quick else CONTENDERS))
+    if not contenders:
+        return
+    rounds = 2 if args.quick else 10
+    conditions = {**training, "step_size": STEP_SIZE, "threads": args.threads, "rounds": rounds, **about()}
+    print(" | ".join(f"{key} {value}" for key, value in conditions.items()), flush=True)
+    rows = summaries(measure(contenders, training, args.threads, rounds), training["frames_per_batch"])
+    print(table(rows))
+    for row in rows:
+        if row["contender"].startswith("ours-scratch") and row["of_best_sb3"]:
+            print(f"{row['contender']}: {row['of_best_sb3']:.2f} times as fast as the best SB3 (aim {AIM})")
+    if output := args.output or (None if args.quick else RESULTS):
+        write(output, [{**row, **conditions} for row in rows])
+        print(f"written to {output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""The benchmarks run; what they measure is no business of a test."""
+
+import csv
+import importlib.util
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+ABOUT = {"commit", "date", "cpu", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
+
+
+def run(script, output, *arguments):
+    command = [sys.executable, BENCHMARKS / script, "--quick", "--threads", "1", "--output", output, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=output.parent)
+    assert done.returncode == 0, done.stderr
+    with output.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) >= ABOUT
+    return rows
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory):
+    """Rows by contender."""
+    rows = run("training_throughput.py", tmp_path_factory.mktemp("training") / "out.csv")
+    return {row["contender"]: row for row in rows}
+
+
+def test_training_throughput_is_measured_and_split_into_shares(training):
+    row = training["ours-scratch-bf16"]
+    assert 0 < float(row["slowest"]) <= float(row["samples_per_second"]) <= float(row["fastest"])
+    assert sum(float(row[key]) for key in ("physics", "forward", "update", "other")) == pytest.approx(1, abs=0.01)
+    assert float(row["memory_mib"]) > 0
+
+
+def test_training_throughput_is_compared_with_stable_baselines3(training):
+    pytest.importorskip("stable_baselines3")
+    row = training["sb3-dummy-16"]
+    assert float(training["ours-scratch-bf16"]["of_best_sb3"]) > 0
+    assert float(row["of_best_sb3"]) == 1
+    assert 0 < float(row["update"]) < 1
+    assert row["physics"] == ""
+
+
+def test_stable_baselines3_is_left_out_and_named_where_it_is_not_installed(monkeypatch, capsys):
+    available = runpy.run_path(str(BENCHMARKS / "training_throughput.py"))["available"]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert available(["ours-mcp-fp32", "sb3-dummy-4"]) == ["ours-mcp-fp32"]
+    assert capsys.readouterr().out == "sb3-dummy-4: skipped, for stable-baselines3 is not installed\n"
+
+
+def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
+    rows = run("primitive_reuse.py", tmp_path / "out.csv")
+    pairs = [(row["character"], row["precision"]) for row in rows]
+    assert pairs == [("ant", "fp32"), ("ant", "bf16"), ("humanoid", "fp32"), ("humanoid", "bf16")]
+    for row in rows:
+        for side in ("reuse_ms", "no_reuse_ms"):
+            assert 0 < float(row[f"{side}_min"]) <= float(row[side])
+        assert float(row["ratio"]) > 0
