@@ -1,0 +1,136 @@
+"""The ant holdout experiment: Figure 5 and the last row of Tables 1 and 2.
+
+    python benchmarks/holdout.py --output runs/holdout    # hours; goes on where it was interrupted
+
+MCP is pre-trained on directions in [0, 3/2 pi] and transferred to [3/2 pi, 2 pi], exploring over actions and over
+weights; so is the additive mixer; scratch learns the held-out directions alone, for as many steps as pre-training and
+transfer take together. Every run is one of ``torchrl-mcp-train``, on one core.
+"""
+
+import argparse
+import csv
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchrl_mcp import experiment
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
+from torchrl_mcp.analysis.figures import save_figure
+
+RESULTS = Path(__file__).resolve().parent / "results"
+PRETRAINING, TRANSFER = 1_000_000, 600_000
+COMMON = ["task=holdout", "preset=fast", "logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false"]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A line of the table."""
+
+    label: str
+    settings: tuple[str, ...]
+    mixer: str | None  # of its pre-training
+    steps: int
+    paper: str
+
+
+CONTENDERS = {
+    "transfer-multiplicative-action": Contender(
+        "MCP, exploring over actions", ("exploration=action",), "multiplicative", TRANSFER, "0.812 +- 0.030"
+    ),
+    "transfer-multiplicative-weights": Contender(
+        "MCP, exploring over weights", ("exploration=weights",), "multiplicative", TRANSFER, ""
+    ),
+    "transfer-additive-action": Contender(
+        "MCP with the additive mixer", ("mixer=additive",), "additive", TRANSFER, ""
+    ),
+    "scratch": Contender("scratch", ("method=scratch",), None, PRETRAINING + TRANSFER, "0.951 +- 0.093"),
+}  # fmt: skip
+
+
+def main() -> None:
+    """Train what is missing, evaluate, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--output", type=Path, default=Path("runs/holdout"), help="folder of the run folders")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
+    parser.add_argument("--episodes", type=int, default=128, help="of each evaluation")
+    arguments = parser.parse_args()
+    chains = [(name, seed) for seed in arguments.seeds for name in CONTENDERS]
+    pretrainings = [(mixer, seed) for seed in arguments.seeds for mixer in ("multiplicative", "additive")]
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        list(pool.map(lambda job: pretrain(arguments.output, *job), pretrainings))
+        list(pool.map(lambda job: learn(arguments.output, *job), chains))
+    report(arguments.output, arguments.seeds, arguments.episodes)
+
+
+def pretrain(folder: Path, mixer: str, seed: int) -> None:
+    """Pre-train a mixer, or finish it."""
+    settings = ["stage=pretrain", f"mixer={mixer}", f"training.total_frames={PRETRAINING}"]
+    train(folder / f"pretrain-{mixer}-{seed}", [*settings, f"seed={seed}"])
+
+
+def learn(folder: Path, name: str, seed: int) -> None:
+    """Train a contender on the held-out directions, or finish it."""
+    contender = CONTENDERS[name]
+    settings = ["stage=transfer", *contender.settings, f"training.total_frames={contender.steps}"]
+    if contender.mixer:
+        settings.append(f"checkpoint={folder / f'pretrain-{contender.mixer}-{seed}'}")
+    train(folder / f"{name}-{seed}", [*settings, f"seed={seed}"])
+
+
+def train(run: Path, settings: list[str]) -> None:
+    """Train in a process of its own, or go on where a former one stopped."""
+    arguments = [f"resume={run}"] if (run / experiment.CONFIG).exists() else [*COMMON, *settings, f"run_dir={run}"]
+    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def report(folder: Path, seeds: list[int], episodes: int) -> None:
+    """Evaluate every run and write table, curves and figure to ``benchmarks/results``."""
+    rows = [row for name in CONTENDERS for seed in seeds for row in evaluate(folder, name, seed, episodes)]
+    with (RESULTS / "holdout.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    groups = {c.label: [folder / f"{name}-{seed}" for seed in seeds] for name, c in CONTENDERS.items()}
+    curves = learning_curves(groups)
+    write_curves(curves, RESULTS / "holdout_curves.csv")
+    save_figure(draw_curves(curves), RESULTS / "holdout_curves")
+    print(table(rows))
+
+
+def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
+    """Return the numbers of a run, deterministic and stochastic."""
+    contender, run = CONTENDERS[name], folder / f"{name}-{seed}"
+    numbers = experiment.evaluate_run(run, episodes=episodes, seed=12345)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    facts = {"contender": name, "label": contender.label, "seed": seed, "frames": contender.steps, "preset": "fast"}
+    machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
+    return [
+        facts | {"mode": mode, "paper": contender.paper} | values | machine
+        for mode, values in numbers.items()
+    ]  # fmt: skip
+
+
+def table(rows: list[dict]) -> str:
+    """Return the results as Markdown: mean and standard deviation over seeds."""
+    lines = ["| | steps | deterministic | stochastic | paper |", "|---|---|---|---|---|"]
+    for name, contender in CONTENDERS.items():
+        cells = []
+        for mode in ("deterministic", "stochastic"):
+            scores = [row["normalised_return"] for row in rows if (row["contender"], row["mode"]) == (name, mode)]
+            spread = f" +- {statistics.stdev(scores):.3f}" if len(scores) > 1 else ""
+            cells.append(f"{statistics.mean(scores):.3f}{spread}")
+        lines.append(f"| {contender.label} | {contender.steps:,} | {' | '.join(cells)} | {contender.paper} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
