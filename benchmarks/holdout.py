@@ -9,6 +9,7 @@ transfer take together. Every run is one of ``torchrl-mcp-train``, on one core.
 
 import argparse
 import csv
+import math
 import os
 import platform
 import statistics
@@ -23,6 +24,7 @@ import torch
 from torchrl_mcp import experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
 from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PRETRAINING, TRANSFER = 1_000_000, 600_000
@@ -52,6 +54,15 @@ CONTENDERS = {
     ),
     "scratch": Contender("scratch", ("method=scratch",), None, PRETRAINING + TRANSFER, "0.951 +- 0.093"),
 }  # fmt: skip
+
+DIRECTIONS = {"pretrain": (0.0, 1.5 * math.pi), "transfer": (1.5 * math.pi, 2.0 * math.pi)}
+SPACING = math.radians(7.5)
+PANELS = {
+    "MCP as pre-trained,\non directions it saw": ("pretrain-multiplicative", "pretrain"),
+    "MCP as pre-trained,\non held-out directions": ("pretrain-multiplicative", "transfer"),
+    "MCP after transfer,\non held-out directions": ("transfer-multiplicative-action", "transfer"),
+    "scratch,\non held-out directions": ("scratch", "transfer"),
+}
 
 
 def main() -> None:
@@ -103,7 +114,17 @@ def report(folder: Path, seeds: list[int], episodes: int) -> None:
     curves = learning_curves(groups)
     write_curves(curves, RESULTS / "holdout_curves.csv")
     save_figure(draw_curves(curves), RESULTS / "holdout_curves")
+    panels = {title: trajectories(folder / f"{name}-{seeds[0]}", stage) for title, (name, stage) in PANELS.items()}
+    save_figure(draw_trajectories(panels), RESULTS / "holdout_trajectories")
     print(table(rows))
+
+
+def trajectories(run: Path, stage: str) -> Trajectories:
+    """Return where a run's policy goes when told the directions of ``stage``."""
+    low, high = DIRECTIONS[stage]
+    directions = torch.linspace(low, high, round((high - low) / SPACING) + 1, dtype=torch.float64)
+    _, agent, env = experiment.restore(run, num_envs=len(directions), seed=12345)
+    return play_directions(agent.actor.policy, env, directions)
 
 
 def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
