@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 from torchrl_mcp import experiment
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
 
@@ -71,8 +71,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/holdout"), help="folder of the run folders")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
+    parser.add_argument("--report", action="store_true", help="train nothing: report the runs that have ended")
     parser.add_argument("--episodes", type=int, default=128, help="of each evaluation")
     arguments = parser.parse_args()
+    if arguments.report:
+        report(arguments.output, arguments.seeds, arguments.episodes)
+        return
     chains = [(name, seed) for seed in arguments.seeds for name in CONTENDERS]
     pretrainings = [(mixer, seed) for seed in arguments.seeds for mixer in ("multiplicative", "additive")]
     with ThreadPoolExecutor(arguments.jobs) as pool:
@@ -104,19 +108,26 @@ def train(run: Path, settings: list[str]) -> None:
 
 
 def report(folder: Path, seeds: list[int], episodes: int) -> None:
-    """Evaluate every run and write table, curves and figure to ``benchmarks/results``."""
-    rows = [row for name in CONTENDERS for seed in seeds for row in evaluate(folder, name, seed, episodes)]
+    """Evaluate every run that has ended and write table, curves and figures to ``benchmarks/results``."""
+    ended = {name: [s for s in seeds if has_ended(folder / f"{name}-{s}", c.steps)] for name, c in CONTENDERS.items()}
+    rows = [row for name in CONTENDERS for seed in ended[name] for row in evaluate(folder, name, seed, episodes)]
     with (RESULTS / "holdout.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    groups = {c.label: [folder / f"{name}-{seed}" for seed in seeds] for name, c in CONTENDERS.items()}
+    groups = {c.label: [folder / f"{name}-{s}" for s in ended[name]] for name, c in CONTENDERS.items() if ended[name]}
     curves = learning_curves(groups)
     write_curves(curves, RESULTS / "holdout_curves.csv")
     save_figure(draw_curves(curves), RESULTS / "holdout_curves")
     panels = {title: trajectories(folder / f"{name}-{seeds[0]}", stage) for title, (name, stage) in PANELS.items()}
     save_figure(draw_trajectories(panels), RESULTS / "holdout_trajectories")
     print(table(rows))
+
+
+def has_ended(run: Path, steps: int) -> bool:
+    """Tell whether a run has taken all its steps."""
+    rows = read_metrics(run)
+    return bool(rows) and rows[-1]["frames"] >= steps
 
 
 def trajectories(run: Path, stage: str) -> Trajectories:
@@ -142,15 +153,22 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
 
 def table(rows: list[dict]) -> str:
     """Return the results as Markdown: mean and standard deviation over seeds."""
-    lines = ["| | steps | deterministic | stochastic | paper |", "|---|---|---|---|---|"]
+    lines = ["| | steps | seeds | deterministic | stochastic | paper |", "|---|---|---|---|---|---|"]
     for name, contender in CONTENDERS.items():
-        cells = []
-        for mode in ("deterministic", "stochastic"):
-            scores = [row["normalised_return"] for row in rows if (row["contender"], row["mode"]) == (name, mode)]
-            spread = f" +- {statistics.stdev(scores):.3f}" if len(scores) > 1 else ""
-            cells.append(f"{statistics.mean(scores):.3f}{spread}")
-        lines.append(f"| {contender.label} | {contender.steps:,} | {' | '.join(cells)} | {contender.paper} |")
+        scores = {
+            mode: [row["normalised_return"] for row in rows if (row["contender"], row["mode"]) == (name, mode)]
+            for mode in ("deterministic", "stochastic")
+        }
+        cells = [spread(values) for values in scores.values()]
+        seeds = len(scores["deterministic"])
+        lines.append(f"| {contender.label} | {contender.steps:,} | {seeds} | {' | '.join(cells)} | {contender.paper} |")
     return "\n".join(lines)
+
+
+def spread(values: list[float]) -> str:
+    """Return mean and standard deviation, as far as there are values."""
+    deviation = f" +- {statistics.stdev(values):.3f}" if len(values) > 1 else ""
+    return f"{statistics.mean(values):.3f}{deviation}" if values else ""
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ import pytest
 from torchrl_mcp.parallel import start, ticks
 
 PARENT = """
-import sys, time
+import signal, sys, time
 from torchrl_mcp.parallel import start
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
     print(start(time.sleep, 60).pid, flush=True)
     time.sleep(60)
 """
@@ -35,7 +36,7 @@ def test_a_process_ends_with_its_parent_however_that_ends(tmp_path, how):
     time.sleep(0.5)
     assert alive(child)
     parent.send_signal(how)
-    parent.wait(timeout=20)
+    parent.wait(timeout=60)
     deadline = time.monotonic() + 20
     while alive(child) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -49,8 +49,8 @@ def test_they_compute_figure_3_one_branch_after_the_other():
 
 
 @pytest.mark.parametrize("initial_std", [0.05, 1.0, 3.0])
-def test_every_primitive_starts_near_zero_mean_and_its_initial_std(initial_std):
-    loc, scale = Primitives(27, 8, 8, initial_std=initial_std)(torch.randn(100, 27))
+def test_with_a_small_gain_every_primitive_starts_at_zero_mean_and_its_initial_std(initial_std):
+    loc, scale = Primitives(27, 8, 8, initial_std=initial_std, output_gain=0.01)(torch.randn(100, 27))
     torch.testing.assert_close(loc, torch.zeros_like(loc), atol=0.02, rtol=0)
     torch.testing.assert_close(scale, torch.full_like(scale, initial_std), atol=0, rtol=0.02)
 
