@@ -1,0 +1,37 @@
+"""What the README shows works."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+SNIPPETS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.parametrize("snippet", SNIPPETS, ids=lambda snippet: snippet.splitlines()[-1][:40])
+def test_every_python_snippet_runs_by_itself(snippet):
+    exec(compile(snippet, "README.md", "exec"), {})
+
+
+def test_the_loss_of_the_stock_agent_reaches_every_parameter_of_its_actor():
+    import torch
+    from torchrl.envs import GymEnv
+    from torchrl.objectives.value import GAE
+
+    (snippet,) = [snippet for snippet in SNIPPETS if "ClipPPOLoss" in snippet]
+    names = {}
+    exec(compile(snippet, "README.md", "exec"), names)
+    torch.manual_seed(0)
+    batch = GymEnv("Pendulum-v1").rollout(20, names["actor"])
+    batch = GAE(gamma=0.99, lmbda=0.95, value_network=names["critic"])(batch)
+    losses = names["loss"](batch)
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    for name, parameter in names["actor"].named_parameters():
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_every_file_that_the_readme_points_to_exists():
+    for path in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
+        assert (ROOT / path).exists(), path
