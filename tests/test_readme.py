@@ -24,8 +24,9 @@ def test_the_loss_of_the_stock_agent_reaches_every_parameter_of_its_actor():
     names = {}
     exec(compile(snippet, "README.md", "exec"), names)
     torch.manual_seed(0)
-    batch = GymEnv("Pendulum-v1").rollout(20, names["actor"])
-    batch = GAE(gamma=0.99, lmbda=0.95, value_network=names["critic"])(batch)
+    with torch.no_grad():
+        batch = GymEnv("Pendulum-v1").rollout(20, names["actor"])
+        batch = GAE(gamma=0.99, lmbda=0.95, value_network=names["critic"])(batch)
     losses = names["loss"](batch)
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in names["actor"].named_parameters():
