@@ -44,13 +44,13 @@ class Contender:
 
 CONTENDERS = {
     "transfer-multiplicative-action": Contender(
-        "MCP, exploring over actions", ("exploration=action",), "multiplicative", TRANSFER, "0.812 +- 0.030"
+        "MCP, over actions", ("exploration=action",), "multiplicative", TRANSFER, "0.812 +- 0.030"
     ),
     "transfer-multiplicative-weights": Contender(
-        "MCP, exploring over weights", ("exploration=weights",), "multiplicative", TRANSFER, ""
+        "MCP, over weights", ("exploration=weights",), "multiplicative", TRANSFER, ""
     ),
     "transfer-additive-action": Contender(
-        "MCP with the additive mixer", ("mixer=additive",), "additive", TRANSFER, ""
+        "additive mixer", ("mixer=additive",), "additive", TRANSFER, ""
     ),
     "scratch": Contender("scratch", ("method=scratch",), None, PRETRAINING + TRANSFER, "0.951 +- 0.093"),
 }  # fmt: skip
