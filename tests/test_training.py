@@ -12,6 +12,8 @@ import torch
 from hydra import compose, initialize_config_module
 
 from torchrl_mcp import checkpoint, experiment
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.training import Trainer
 
 TIMES = ("seconds", "time/")
 
@@ -136,6 +138,27 @@ def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypa
     monkeypatch.setattr(experiment.Trainer, "_update_normalisers", meddle)
     with pytest.raises(RuntimeError, match="primitives"):
         experiment.train(cfg)
+
+
+def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all(tmp_path, monkeypatch):
+    threads = {"step": set(), "update": set()}
+
+    def watch(section, method):
+        def watched(*args):
+            threads[section].add(torch.get_num_threads())
+            return method(*args)
+
+        return watched
+
+    monkeypatch.setattr(CharacterEnv, "_step", watch("step", CharacterEnv._step))
+    monkeypatch.setattr(Trainer, "_update", watch("update", Trainer._update))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        experiment.train(configure(tmp_path))
+    finally:
+        torch.set_num_threads(before)
+    assert threads == {"step": {1}, "update": {2}}
 
 
 def test_the_shares_of_time_add_up_to_the_whole(pretrained):

@@ -1,7 +1,8 @@
 """The training loop: collect, estimate advantages, update, record. One loop for every method."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -119,7 +120,7 @@ class Trainer:
             while self.progress.frames < self.total_frames:
                 start, physics = time.perf_counter(), self.env.physics_seconds
                 self.stopwatch.seconds.clear()
-                with self._precision():
+                with self._precision(), _one_thread():
                     batch = next(batches)
                 self.stopwatch.add("physics", self.env.physics_seconds - physics)
                 metrics = self._episode_metrics(batch) | self._gate_metrics(batch)
@@ -252,6 +253,20 @@ class Trainer:
     def _precision(self) -> torch.autocast:
         # Entered anew for every use: within one context autocast keeps its copies of the weights.
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch to the calling thread, and the processors to physics.
+
+    OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step takes.
+    """
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)
 
 
 def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
