@@ -32,9 +32,11 @@ class CharacterEnv(EnvBase):
         max_episode_steps: Actions until an episode is ``truncated``.
         episode: What the task remembers of one simulation at first; kept as ``(N, ...)``.
         outputs: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
+        model_fields: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
         persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
+        current: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         dtype: Type of what is emitted; physics and reward are computed in float64.
         pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (TorchRL merges what a partial
             reset emits into new tensors, which are not pinned.)
@@ -55,9 +57,11 @@ class CharacterEnv(EnvBase):
         max_episode_steps: int,
         episode: Mapping[str, Tensor],
         outputs: Sequence[str] = (),
+        model_fields: Sequence[str] = (),
         seed: int | None = None,
         num_threads: int = 0,
         persistent: bool = False,
+        current: bool = False,
         dtype: torch.dtype = torch.float32,
         pin_memory: bool = False,
     ) -> None:
@@ -75,7 +79,14 @@ class CharacterEnv(EnvBase):
         self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
         self.control_timestep = substeps * model.opt.timestep
         self.simulation = Simulation(
-            model, num_envs, substeps=substeps, outputs=outputs, num_threads=num_threads, persistent=persistent
+            model,
+            num_envs,
+            substeps=substeps,
+            outputs=outputs,
+            model_fields=model_fields,
+            num_threads=num_threads,
+            persistent=persistent,
+            current=current,
         )
         episode = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
         self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()}
@@ -110,13 +121,14 @@ class CharacterEnv(EnvBase):
         self.generator.set_state(state["generator"].cpu())
         self.num_faults = state["faults"]
 
-    def render(self, index: int = 0, *, width: int = 480, height: int = 480) -> Tensor:
-        """Draw one simulation, shape ``(height, width, 3)``, uint8."""
+    def render(self, index: int = 0, *, width: int = 480, height: int = 480, distance: float = 4.0) -> Tensor:
+        """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
         if not 0 <= index < self.num_envs:
             raise ValueError(f"index={index} names no simulation: pass one of 0..{self.num_envs - 1}")
         if (width, height) not in self._cameras:
             self._cameras[width, height] = Camera(self.simulation.model, width=width, height=height)
-        return self._cameras[width, height].picture(self.simulation.data(index), self._arrows(index))
+        camera = self._cameras[width, height]
+        return camera.picture(self.simulation.data(index), self._arrows(index), distance=distance)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free what drawing holds."""
@@ -127,14 +139,21 @@ class CharacterEnv(EnvBase):
     def _make_specs(self) -> None:
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
-        bounds = torch.from_numpy(self.simulation.model.actuator_ctrlrange).to(self._dtype)
-        low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
-        observed = {key: Unbounded(value.shape, dtype=self._dtype) for key, value in self._observe().items()}
+        low, high = self._action_bounds().to(self._dtype).expand(self.num_envs, -1, -1).unbind(-1)
+        observed = {key: self._spec(value) for key, value in self._observe().items()}
         self.observation_spec = Composite(observed, shape=shape)
         self.action_spec = Bounded(low, high, dtype=self._dtype)
         self.reward_spec = Unbounded(one, dtype=self._dtype)
         done = {key: Binary(1, shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         self.full_done_spec = Composite(done, shape=shape)
+
+    def _type(self, value: Tensor) -> torch.dtype:
+        """Type in which something observed is emitted: flags remain flags."""
+        return torch.bool if value.dtype is torch.bool else self._dtype
+
+    def _spec(self, value: Tensor) -> Binary | Unbounded:
+        dtype = self._type(value)
+        return Binary(shape=value.shape, dtype=dtype) if dtype is torch.bool else Unbounded(value.shape, dtype=dtype)
 
     def _set_seed(self, seed: int | None) -> None:
         drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
@@ -148,13 +167,13 @@ class CharacterEnv(EnvBase):
                 f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on the CPU, "
                 "where the physics runs"
             )
-        faults = self.simulation.step(action)
+        faults = self.simulation.step(self._controls(action))
         self.episode["elapsed_steps"] += 1
         reward, terminated = self._judge(faults)
         if len(faults):
             reward[faults], terminated[faults] = 0.0, True
             self.num_faults += len(faults)
-        truncated = self.episode["elapsed_steps"] >= self.max_episode_steps
+        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._exhausted()
         return self._emit(reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
@@ -191,12 +210,24 @@ class CharacterEnv(EnvBase):
         return {key: value[ids] for key, value in given.items()}
 
     def _emit(self, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
-        emitted = {key: value.to(self._dtype, copy=True) for key, value in self._observe().items()}
+        emitted = {key: value.to(self._type(value), copy=True) for key, value in self._observe().items()}
         emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
         if reward is not None:
             emitted["reward"] = reward
         out = TensorDict(emitted, self.batch_size, device=self.device)
         return out.pin_memory() if self._pin_memory else out
+
+    def _action_bounds(self) -> Tensor:
+        """Lower and upper bounds of the action, ``(A, 2)``: those of the controls."""
+        return torch.from_numpy(self.simulation.model.actuator_ctrlrange)
+
+    def _controls(self, action: Tensor) -> Tensor:
+        """What the actuators are given, ``(N, A)``: the action as it is."""
+        return action
+
+    def _exhausted(self) -> Tensor:
+        """Whether the task cannot go on, through no fault of the character: truncates the episode, ``(N, 1)``."""
+        return torch.zeros(self.num_envs, 1, dtype=torch.bool)
 
     @abstractmethod
     def _sample(self, num: int) -> dict[str, Tensor]:
@@ -208,7 +239,7 @@ class CharacterEnv(EnvBase):
 
     @abstractmethod
     def _observe(self) -> dict[str, Tensor]:
-        """Observation and goal, each ``(N, ...)``."""
+        """Observation, goal and, for tasks that can succeed, the flag ``success``, each ``(N, ...)``."""
 
     @abstractmethod
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,5 @@
 """The holdout task: an ant walks in directions it was not trained in."""
 
-import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -8,6 +7,7 @@ import gymnasium
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
 from torchrl_mcp.envs.rendering import Arrow
@@ -81,18 +81,15 @@ class Holdout(CharacterEnv):
         dtype: torch.dtype = torch.float32,
         pin_memory: bool = False,
     ) -> None:
-        directions = _interval("directions", directions)
-        healthy_z_range = _interval("healthy_z_range", healthy_z_range)
-        scales = {
-            "forward_weight": forward_weight,
-            "healthy_weight": healthy_weight,
-            "control_weight": control_weight,
-            "contact_weight": contact_weight,
-            "reset_noise_scale": reset_noise_scale,
-        }
-        for name, value in scales.items():
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name}={value} is not a finite number of at least 0: costs carry their sign already")
+        directions = interval("directions", directions)
+        healthy_z_range = interval("healthy_z_range", healthy_z_range)
+        not_negative(
+            forward_weight=forward_weight,
+            healthy_weight=healthy_weight,
+            control_weight=control_weight,
+            contact_weight=contact_weight,
+            reset_noise_scale=reset_noise_scale,
+        )
         model = ant().compile()
         episode = {"goal": torch.zeros(2, dtype=dtype), "position": torch.zeros(2, dtype=torch.float64)}
         if contact_forces:
@@ -177,14 +174,3 @@ class Holdout(CharacterEnv):
         tail = self.simulation.state["qpos"][index, :3] + torch.tensor([0.0, 0.0, 0.6])
         tip = tail + torch.nn.functional.pad(self.episode["goal"][index], (0, 1))
         return [(tail.numpy(), tip.double().numpy())]
-
-
-def _interval(name: str, value: Sequence[float]) -> tuple[float, float]:
-    """Check that ``value`` is a pair of finite numbers in order."""
-    try:
-        low, high = map(float, value)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not -math.inf < low <= high < math.inf:
-        raise ValueError(f"{name}={value!r} is no interval: pass two finite numbers (lo, hi), lo <= hi")
-    return low, high

@@ -17,13 +17,12 @@ class Camera:
         width: Pixels.
         height: Pixels.
         body: The body to follow, 1 for the first below the world.
-        distance: Metres from the camera to the body.
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
 
-    def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1, distance: float = 4.0) -> None:
+    def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1) -> None:
         buffer = model.vis.global_
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
         try:
@@ -35,11 +34,12 @@ class Camera:
             ) from error
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        self.view.trackbodyid, self.view.distance = body, distance
+        self.view.trackbodyid = body
         self.view.azimuth, self.view.elevation = 90.0, -30.0
 
-    def picture(self, data: mujoco.MjData, arrows: list[Arrow]) -> Tensor:
-        """Draw the simulation, shape ``(height, width, 3)``, uint8."""
+    def picture(self, data: mujoco.MjData, arrows: list[Arrow], *, distance: float) -> Tensor:
+        """Draw the simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
+        self.view.distance = distance
         self.renderer.update_scene(data, self.view)
         scene = self.renderer.scene
         for tail, tip in arrows:

@@ -1,6 +1,31 @@
 """Rewards of the paper's tasks, as functions of tensors."""
 
+from functools import partial
+
+import torch
 from torch import Tensor
+
+
+def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
+    r"""Reward of the heading task: walk in a target direction at a target speed.
+
+    .. math:: r = \exp(-4 (\hat{u} \cdot v_{com} - \hat{v})^2)
+
+    Args:
+        velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
+        direction: Target direction :math:`\hat{u}`, a unit vector, shape ``(*B, 2)``. The paper writes
+            :math:`(\cos\hat{\theta}, -\sin\hat{\theta})` for a world whose y axis points up; here z does, and
+            :math:`\hat{u} = (\cos\hat{\theta}, \sin\hat{\theta})`.
+        speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
+
+    Returns:
+        Reward, shape ``(*B)``.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        appendix D, https://arxiv.org/abs/1905.09808
+    """
+    return (-4 * ((direction * velocity).sum(-1) - speed).square()).exp()
 
 
 def holdout_reward(
@@ -47,3 +72,60 @@ def holdout_reward(
     if contact_forces is None:
         return reward
     return reward - contact_weight * contact_forces.square().sum(-1)
+
+
+def transport_reward(
+    com: Tensor,
+    com_velocity: Tensor,
+    position: Tensor,
+    velocity: Tensor,
+    target: Tensor,
+    *,
+    weights: tuple[float, float, float, float],
+    proximity_scale: float,
+    speed: float,
+    target_distance_power: float,
+) -> Tensor:
+    r"""Reward of the carry and dribble tasks: go to an object, stay with it, and move it to its target.
+
+    .. math::
+        r &= w^{cv} r^{cv} + w^{cp} r^{cp} + w^{bv} r^{bv} + w^{bp} r^{bp} \\
+        r^{cv} &= \exp(-1.5 \min(0, u_b \cdot v_{com} - \hat{v})^2) \\
+        r^{cp} &= \exp(-c \, \|x_{com} - x_b\|^2) \\
+        r^{bv} &= \exp(-\min(0, u_{tar} \cdot v_b - \hat{v})^2) \\
+        r^{bp} &= \exp(-0.5 \, \|x_b - x_{tar}\|^p)
+
+    where the minimum is squared, :math:`u_b` is the direction from the character to the object and :math:`u_{tar}` that
+    from the object to the target. All quantities are horizontal.
+
+    Args:
+        com: Centre of mass of the character :math:`x_{com}`, shape ``(*B, 2)``, in metres.
+        com_velocity: Its velocity :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
+        position: Position of the object :math:`x_b`, shape ``(*B, 2)``, in metres.
+        velocity: Its velocity :math:`v_b`, shape ``(*B, 2)``, in m/s.
+        target: Position of the target :math:`x_{tar}`, shape ``(*B, 2)``, in metres.
+        weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
+        proximity_scale: :math:`c`, per square metre.
+        speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
+        target_distance_power: :math:`p`. Paper: 2.
+
+    Returns:
+        Reward, shape ``(*B)``.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        appendix D, https://arxiv.org/abs/1905.09808
+    """
+    ways = torch.stack([position - com, target - position])
+    towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a way of no length
+    missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
+    (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
+    exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
+    return exponents.exp() @ exponents.new_tensor(weights)
+
+
+carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)
+""":func:`transport_reward` with the constants of the carry task."""
+
+dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)
+""":func:`transport_reward` with the constants of the dribble task."""

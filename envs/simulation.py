@@ -32,9 +32,12 @@ class Simulation:
         num_envs: Number N of simulations.
         substeps: Physics steps per call of :meth:`step`.
         num_threads: Threads; 0 takes one per processor. Results do not depend on it.
-        outputs: The other ``MjData`` fields to expose. After :meth:`step` they are one substep behind the state, as
-            after ``mj_step``; after :meth:`reset` they are current.
+        outputs: The other ``MjData`` fields to expose, beside the sensors. After :meth:`step` they are one substep behind
+            the state, as after ``mj_step``; after :meth:`reset` they are current.
+        model_fields: The ``MjModel`` fields of which every simulation has its own. They count as state.
         persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
+        current: Bring outputs that follow from positions and velocities up to the state after every step. Free of
+            charge if ``persistent``: the next step begins with what was computed.
     """
 
     def __init__(
@@ -44,23 +47,29 @@ class Simulation:
         *,
         substeps: int,
         outputs: Sequence[str] = (),
+        model_fields: Sequence[str] = (),
         num_threads: int = 0,
         persistent: bool = False,
+        current: bool = False,
     ) -> None:
         self.model = copy.copy(model)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.substeps = substeps
+        self._stage = mujoco.mjtStage.mjSTAGE_VEL if current else mujoco.mjtStage.mjSTAGE_NONE
         self.physics_seconds = 0.0
         """Wall-clock seconds spent inside MuJoCo so far."""
         self._batch = Batch(self.model, num_envs, num_threads, persistent)
         self._data = mujoco.MjData(self.model)
         fields = {name: self._batch.bind(name) for name in (*CHANGING_FIELDS, *GIVEN_FIELDS)}
+        fields.update((name, self._batch.expand(name)) for name in model_fields)
         self._fields = {name: field for name, field in fields.items() if field.size}
         self.state = {name: torch.from_numpy(field) for name, field in self._fields.items()}
         """Live views of the state fields that the model has, each ``(N, ...)``, float64. Writing sets the state."""
+        self._model_fields = tuple(model_fields)
         self._rows = self._batch.state[:, : sum(fields[name][0].size for name in CHANGING_FIELDS)]
         self._initial, self._before = self._batch.state[0].copy(), np.empty_like(self._rows)
-        self.outputs = {name: _view(self._batch.bind(name)) for name in outputs}
+        sensors = ["sensordata"] if model.nsensordata else []
+        self.outputs = {name: _view(self._batch.bind(name)) for name in (*outputs, *sensors)}
         """Live views of the outputs, each ``(N, ...)``: results of the last call, not to be written to."""
 
     def step(self, ctrl: Tensor) -> Tensor:
@@ -75,7 +84,7 @@ class Simulation:
         controls = ctrl.detach().numpy()
         np.copyto(self._before, self._rows)
         np.copyto(self._fields["ctrl"], controls)
-        failed = self._run(self._batch.step, nstep=self.substeps)
+        failed = self._run(self._batch.step, nstep=self.substeps, stage=self._stage)
         if not len(failed) and _bounded(controls) and _bounded(self._rows):
             return torch.from_numpy(_NOBODY)
         faults = ~(_bounded(controls, -1) & _bounded(self._rows, -1))
@@ -95,6 +104,8 @@ class Simulation:
         """
         rows = ids.numpy()
         self._batch.state[rows] = self._initial
+        for name in self._model_fields:
+            self._fields[name][rows] = getattr(self.model, name)
         for name, value in fields.items():
             self._fields[name][rows] = value.numpy()
         if len(failed := self._run(self._batch.forward, rows)):
@@ -123,7 +134,7 @@ class Simulation:
     def data(self, index: int) -> mujoco.MjData:
         """One simulation as an ``MjData`` with everything computed, to draw it or to look into it."""
         self._batch.get_data(index, self._data)
-        mujoco.mj_forward(self.model, self._data)
+        mujoco.mj_forward(self._batch.get_model(index), self._data)
         return self._data
 
     def _run(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> np.ndarray:

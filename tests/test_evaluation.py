@@ -146,11 +146,33 @@ def episodes(returns, lengths=None, terminated=None):
     )
 
 
+class Measured(Countdown):
+    """Raises a flag in the second step of every episode, and counts the steps."""
+
+    def __init__(self, lengths):
+        super().__init__(lengths)
+        one = (*self.batch_size, 1)
+        self.observation_spec["success"] = Binary(1, shape=one, dtype=torch.bool)
+        self.observation_spec["steps"] = Unbounded(one)
+
+    def _emit(self, done, **kwargs):
+        elapsed = self.elapsed.unsqueeze(-1)
+        return super()._emit(done, success=elapsed == 2, steps=elapsed.float(), **kwargs)
+
+
+def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
+    outcome = evaluate(IDLE, Measured([1, 2, 5]))
+    assert outcome.measures["success"].tolist() == [False, True, True]
+    assert outcome.measures["steps"].tolist() == [1.0, 1.5, 3.0]
+    assert summary(outcome, lambda returns: returns)["measures"] == pytest.approx({"success": 2 / 3, "steps": 5.5 / 3})
+
+
 def test_a_summary_of_four_episodes_by_hand():
     outcome = episodes([0.0, 2.0, 4.0, 6.0], [1, 2, 3, 10], [True, False, False, False])
     numbers = summary(outcome, lambda returns: returns / 10)
     low, high = numbers.pop("interval")
     assert 0 <= low < 0.3 < high <= 0.6
+    assert numbers.pop("measures") == {}
     assert numbers == pytest.approx(
         {
             "normalised_return": 0.3,

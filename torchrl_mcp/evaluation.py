@@ -1,7 +1,7 @@
 """How good is a policy? One episode in each of many environments."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDictBase
@@ -19,12 +19,20 @@ class Evaluation:
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
+        measures: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
+            as ``success``; of a number, its mean over the steps, as ``tracking_error``.
     """
 
     returns: Tensor
     lengths: Tensor
     terminated: Tensor
     positions: Tensor
+    measures: dict[str, Tensor] = field(default_factory=dict)
+
+
+def measured(env: EnvBase) -> list[str]:
+    """Names of what a task observes for the record, beside ``observation`` and ``goal``."""
+    return [key for key in env.observation_spec.keys() if key not in ("observation", "goal")]  # noqa: SIM118
 
 
 @torch.no_grad()
@@ -53,7 +61,10 @@ def evaluate(
     returns = torch.zeros(env.batch_size)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     terminated = torch.zeros_like(running)
-    positions = []
+    positions, flags, sums = [], {}, {}
+    for key in measured(env):
+        measures = flags if env.observation_spec[key].dtype is torch.bool else sums
+        measures[key] = torch.zeros(env.batch_size, dtype=env.observation_spec[key].dtype)
     with set_exploration_type(exploration):
         while running.any():
             action = policy(state.select("observation", "goal").to(device))["action"]
@@ -62,9 +73,14 @@ def evaluate(
             returns += outcome["reward"].squeeze(-1) * running
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
+            for key, raised in flags.items():
+                raised |= running & outcome[key].squeeze(-1)
+            for key, total in sums.items():
+                total += outcome[key].squeeze(-1) * running
             running &= ~outcome["done"].squeeze(-1)
             positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
-    return Evaluation(returns, lengths, terminated, torch.stack(positions))
+    means = {key: total / lengths for key, total in sums.items()}
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), flags | means)
 
 
 def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:
@@ -77,7 +93,8 @@ def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], 
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction), the standard deviation over episodes, and a 95 % percentile bootstrap interval of the mean.
+        fraction, ``measures``), the standard deviation over episodes, and a 95 % percentile bootstrap interval of the
+        mean.
     """
     normalised = normalised_return(outcome.returns)
     generator = torch.Generator().manual_seed(0)
@@ -91,4 +108,5 @@ def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], 
         "length": outcome.lengths.float().mean().item(),
         "terminated": outcome.terminated.float().mean().item(),
         "episodes": len(normalised),
+        "measures": {key: value.float().mean().item() for key, value in outcome.measures.items()},
     }

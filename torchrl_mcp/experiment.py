@@ -34,7 +34,16 @@ class Agent:
 
 
 def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv:
-    """Return the environments of the configured task and stage."""
+    """Return the environments of the configured task and stage.
+
+    Raises:
+        ValueError: If the task has no such stage.
+    """
+    if cfg.stage.name not in cfg.task:
+        raise ValueError(
+            f"task={cfg.task.name} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
+            f"task={cfg.task.name} with stage=transfer and checkpoint=<folder of the pre-training>"
+        )
     return instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
 
 

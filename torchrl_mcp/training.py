@@ -20,6 +20,7 @@ from torchrl_mcp.actors import Actor
 from torchrl_mcp.checkpoint import load, run_checkpoint
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.episodes import EpisodeStatistics
+from torchrl_mcp.evaluation import measured
 from torchrl_mcp.modules import RunningNormaliser, gate_diagnostics
 from torchrl_mcp.objectives import Advantages
 from torchrl_mcp.progress import SECTIONS, Progress, Stopwatch
@@ -225,6 +226,7 @@ class Trainer:
             "episode/length": lengths.mean().item(),
             "episode/faults": self.env.num_faults,
             "reward": batch["next", "reward"].mean().item(),
+            **{f"task/{key}": batch["next", key].float().mean().item() for key in measured(self.env)},
         }
 
     def _gate_metrics(self, batch: TensorDictBase) -> dict[str, float]:

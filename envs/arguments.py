@@ -1,0 +1,30 @@
+"""Checks of what users pass."""
+
+import math
+from collections.abc import Sequence
+
+
+def interval(name: str, value: Sequence[float]) -> tuple[float, float]:
+    """Check that ``value`` is a pair of finite numbers in order, and return it.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not -math.inf < low <= high < math.inf:
+        raise ValueError(f"{name}={value!r} is no interval: pass two finite numbers (lo, hi), lo <= hi")
+    return low, high
+
+
+def not_negative(**values: float) -> None:
+    """Check that values are finite and at least 0.
+
+    Raises:
+        ValueError: If one is not, with its name.
+    """
+    for name, value in values.items():
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"{name}={value} is out of range: pass a finite number of at least 0")

@@ -1,0 +1,42 @@
+"""What MuJoCo's file of a body cannot say about it."""
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+
+import mujoco
+
+
+@dataclass(frozen=True)
+class Character:
+    """An articulated body under PD control.
+
+    Its MJCF file holds the body alone, without floor, light or task, standing in its rest pose: x forward, y left, z
+    up, soles on z = 0. The root has a free joint; every other body has one joint of its own name, ball or hinge, or is
+    welded to its parent. A hinge has one ``position`` actuator of that name, a ball joint three, ``<name>_x``, ``_y``
+    and ``_z``, which together are PD control of the exponential map. Shapes are spheres, capsules and boxes with
+    ``contype=0 conaffinity=1``: they collide with a scene whose shapes have ``contype=1``, not with one another.
+
+    Args:
+        name: Of the character and of its file.
+        feet: Bodies that may touch the ground.
+        key_bodies: Bodies whose positions say most about a pose: head, hands, feet.
+        carrier: Body that picks up the box of the carry task, or None for a character that cannot.
+    """
+
+    name: str
+    feet: tuple[str, ...]
+    key_bodies: tuple[str, ...]
+    carrier: str | None
+
+    def spec(self, *, self_collision: bool = False) -> mujoco.MjSpec:
+        """Return the body, to be put into a scene.
+
+        Args:
+            self_collision: Let its bodies collide with one another, but for those that a joint connects.
+        """
+        with as_file(files(__package__) / f"{self.name}.xml") as path:
+            spec = mujoco.MjSpec.from_file(str(path))
+        for geom in spec.geoms:
+            if self_collision and geom.conaffinity:
+                geom.contype = 1
+        return spec

@@ -1,0 +1,121 @@
+"""The dribble task: move a ball to a target with the feet."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.rewards import dribble_reward
+from torchrl_mcp.envs.transport import SUCCESS_DISTANCE, Transport, clear_of
+
+# Radius, mass, friction and damping of the ball: those of the same authors' public code.
+RADIUS = 0.2
+MASS = 0.43
+FRICTION = 0.4
+DAMPING = -math.log(1 - 0.4)
+"""Rate per second at which the ball loses speed and spin: its simulator's 0.4 is the share that is lost in a second."""
+
+SUCCESS_REACH = 2.0
+"""Metres from the ball within which the character must be for the task to count as done."""
+
+
+class Dribble(Transport):
+    """A character moves a ball to a target.
+
+    ``goal`` (16) is the position of the target, and position, orientation, linear and angular velocity of the ball.
+    See :class:`~torchrl_mcp.envs.transport.Transport` for ``success``, for which the character must also be within 2 m
+    of the ball, and for the variants of the reward.
+
+    The ball meets ground and all of the character, with its own friction. Its damping slows translation and rotation
+    alike, so that it rolls on without slipping and its speed falls to 60 % in a second.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        object_distances: Range (lo, hi) of the ball's distance from the character, in metres. Paper: 0 to 10; here from
+            0.5, as in the same authors' public code, or from where the ball does not touch the character.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transport.Transport`: distances, reward and time limit.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        appendix D, https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> env = Dribble("biped", num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "goal"].shape
+        torch.Size([2, 3, 16])
+    """
+
+    def __init__(
+        self, character: str, num_envs: int, *, object_distances: Sequence[float] = (0.5, 10.0), **kwargs: Any
+    ) -> None:
+        super().__init__(
+            character,
+            num_envs,
+            things={"target": 3, "ball": 13},
+            furnish=add_pitch,
+            reward=dribble_reward,
+            object_distances=object_distances,
+            **kwargs,
+        )
+        clearance = self._reach(0.0, 2 * RADIUS) + RADIUS
+        self.object_distances = clear_of("object_distances", self.object_distances, clearance)
+        self._make_specs()
+
+    def success(self) -> Tensor:
+        """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
+        near = torch.linalg.vector_norm((self._com - self._object)[:, :2], dim=-1) < SUCCESS_REACH
+        return super().success() & near
+
+
+def add_pitch(spec: mujoco.MjSpec) -> None:
+    """Add a target on the ground, which nothing collides with, and the ball."""
+    target = spec.worldbody.add_body(name="target", mocap=True)
+    disc, ghost = mujoco.mjtGeom.mjGEOM_CYLINDER, {"contype": 0, "conaffinity": 0}
+    target.add_geom(type=disc, size=[SUCCESS_DISTANCE, 0.002, 0], rgba=[0.9, 0.1, 0.1, 0.5], **ghost)
+    target.add_geom(type=disc, size=[0.03, 0.75, 0], pos=[0, 0, 0.75], rgba=[0.9, 0.1, 0.1, 1], **ghost)
+    add_ball(spec)
+
+
+def add_ball(spec: mujoco.MjSpec) -> None:
+    """Add the ball, solid, at rest on the ground.
+
+    A free joint has one damping for forces and torques. Three slides and a ball joint have the same coordinates and a
+    damping each.
+    """
+    ball = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
+    for name, axis, at in zip("xyz", np.eye(3), ball.pos, strict=True):
+        slide, damping = mujoco.mjtJoint.mjJNT_SLIDE, [MASS * DAMPING, 0, 0]
+        ball.add_joint(name=f"ball_{name}", type=slide, axis=axis, ref=at, damping=damping, armature=0)
+    damping = [0.4 * MASS * RADIUS**2 * DAMPING, 0, 0]
+    ball.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, damping=damping, armature=0)
+    spec.add_texture(
+        name="ball",
+        type=mujoco.mjtTexture.mjTEXTURE_CUBE,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        width=64,
+        height=384,
+        rgb1=[0.95, 0.95, 0.95],
+        rgb2=[0.1, 0.1, 0.1],
+    )
+    material = spec.add_material(name="ball")
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ball"
+    ball.add_geom(
+        name="ball",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[RADIUS, 0, 0],
+        mass=MASS,
+        material="ball",
+        rgba=[1, 1, 1, 1],
+        contype=1,
+        conaffinity=1,
+        friction=[FRICTION, 0, 0],
+        priority=1,  # its friction counts, not the greater of the two
+    )

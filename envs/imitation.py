@@ -1,0 +1,177 @@
+"""Motion imitation: the task from which primitives are pre-trained."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.joints import joint_layout
+from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.motions.library import MotionLibrary, MotionState
+from torchrl_mcp.envs.motions.placement import Placement, placing
+from torchrl_mcp.envs.observations import bodies_in_heading_frame
+from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
+from torchrl_mcp.envs.rotations import rotate
+from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_reward
+
+NUM_TARGETS = 2
+"""States of the reference that the goal shows ahead (section 4)."""
+
+
+class Imitation(PDCharacterEnv):
+    r"""A character follows reference motions, which change in the middle of an episode.
+
+    An episode begins at a random moment of a random clip, in the reference's own state. With probability
+    :math:`\Delta t /` ``switch_interval`` per step the reference becomes another random moment, brought to where the
+    character is and faces. ``goal`` (2 x 13 L) holds, for the next two steps, the positions of the L bodies of the
+    reference relative to the ground below the character, their orientations and velocities, in its heading frame.
+    ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in metres.
+
+    The reward is :func:`~torchrl_mcp.envs.tracking.tracking_reward` of these errors: ``pose``, the mean squared angle
+    of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and ``root_velocity``, the
+    squared distance plus a tenth of the squared angle of the root; ``key_positions``, the mean squared distance of the
+    character's key bodies relative to the root; ``com``, the squared distance of the centre of mass.
+
+    An episode ends, without reward and without value beyond, when the character falls or its bodies are on average
+    further than ``max_error`` from the reference. The end of a clip that does not loop truncates it, as the time limit
+    does, and the value of what would follow counts.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        library: Reference motions of that character.
+        num_envs: Number N of simulations.
+        terms: Weight and scale of each error in the reward, by name.
+        max_error: Largest mean distance of bodies from the reference, in metres.
+        switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range, or the motions are of another character.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        section 4, https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self,
+        character: str,
+        library: MotionLibrary,
+        num_envs: int,
+        *,
+        terms: Mapping[str, Mapping[str, float]],
+        max_error: float = 0.3,
+        switch_interval: float = 5.0,
+        max_episode_steps: int = 300,
+        **kwargs: Any,
+    ) -> None:
+        if library.character != character:
+            raise ValueError(f"library holds motions of {library.character}: pass motions of character={character!r}")
+        not_negative(max_error=max_error)
+        if not switch_interval > 0:
+            raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
+        self.library, self.max_error = library, max_error
+        self.terms = {name: Term(**term) for name, term in terms.items()}
+        self.switch_probability = CONTROL_TIMESTEP / switch_interval
+        self._layout, names = joint_layout(character), library.body_names
+        self._keys = [names.index(body) for body in CHARACTERS[character].key_bodies]
+        reference = {
+            "clip": torch.zeros((), dtype=torch.int64),
+            "time": torch.zeros((), dtype=torch.float64),
+            "turn": torch.zeros((), dtype=torch.float64),
+            "shift": torch.zeros(2, dtype=torch.float64),
+            "error": torch.zeros((), dtype=torch.float64),
+        }
+        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
+        if unknown := self.terms.keys() - self._errors(self._reference(0)).keys():
+            raise ValueError(f"terms name {sorted(unknown)}, which are no errors: see the documentation of Imitation")
+        self._make_specs()
+
+    def normalised_return(self, episode_return: Tensor) -> Tensor:
+        r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`R / (T \sum_i w_i)`."""
+        return episode_return / (self.max_episode_steps * sum(term.weight for term in self.terms.values()))
+
+    def _reference(self, steps: int) -> MotionState:
+        """The reference as many steps ahead, in the world."""
+        episode = self.episode
+        moment = self.library.at(episode["clip"], episode["time"] + steps * CONTROL_TIMESTEP)
+        return moment.placed(Placement(episode["turn"], episode["shift"]))
+
+    def _sample(self, num: int) -> dict[str, Tensor]:
+        clips, times = self.library.sample(num, self.generator)
+        moment = self.library.at(clips, times)
+        shift = -moment.qpos[:, :2]
+        placed = moment.placed(Placement(torch.zeros(num, dtype=torch.float64), shift))
+        return {
+            "qpos": placed.qpos,
+            "qvel": placed.qvel,
+            "clip": clips,
+            "time": times,
+            "turn": torch.zeros(num, dtype=torch.float64),
+            "shift": shift,
+            "error": torch.zeros(num, dtype=torch.float64),
+        }
+
+    def _observe(self) -> dict[str, Tensor]:
+        angle, origin = self.heading(), self._positions[:, 0] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        targets = [self._reference(step).bodies for step in range(1, NUM_TARGETS + 1)]
+        goal = [bodies_in_heading_frame(angle, origin, target) for target in targets]
+        return {
+            "observation": self._state(angle),
+            "goal": torch.cat(goal, -1),
+            "tracking_error": self.episode["error"].unsqueeze(-1),
+        }
+
+    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+        self.episode["time"] += CONTROL_TIMESTEP
+        reference = self._reference(0)
+        error = torch.linalg.vector_norm(self._positions - reference.bodies.positions, dim=-1).mean(-1)
+        lost = self.episode["error"].copy_(error) > self.max_error
+        reward, fallen = self._unless_fallen(tracking_reward(self._errors(reference), self.terms))
+        self._switch()
+        return reward.masked_fill(lost, 0.0), fallen | lost
+
+    def _switch(self) -> None:
+        """Give some characters another reference, beginning where they are and facing as they do."""
+        chance = torch.rand(self.num_envs, generator=self.generator)
+        ids = (chance < self.switch_probability).nonzero().squeeze(-1)
+        if not len(ids):
+            return
+        clips, times = self.library.sample(len(ids), self.generator)
+        placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][ids])
+        changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
+        for key, value in changed.items():
+            self.episode[key][ids] = value
+
+    def _errors(self, reference: MotionState) -> dict[str, Tensor]:
+        """How far the character is from the reference in each respect, ``(N,)`` each."""
+        qpos, qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
+        layout, keys = self._layout, self._keys
+        angles = squared_angles(qpos[:, layout.quaternions], reference.qpos[:, layout.quaternions])
+        hinges = (qpos[:, layout.angles] - reference.qpos[:, layout.angles]).square()
+        at, target = self._positions - self._positions[:, :1], reference.bodies.positions
+        moves = (qvel - reference.qvel).square()
+        return {
+            "pose": torch.cat([angles[:, 1:], hinges], -1).mean(-1),
+            "velocity": moves[:, 6:].sum(-1) / (len(layout.names) - 1),
+            "root_pose": squared_distances(qpos[:, :3], reference.qpos[:, :3]) + 0.1 * angles[:, 0],
+            "root_velocity": moves[:, :3].sum(-1) + 0.1 * moves[:, 3:6].sum(-1),
+            "key_positions": squared_distances(at, target - target[:, :1])[:, keys].mean(-1),
+            "com": squared_distances(self._com, self._centre_of_mass(reference.bodies)),
+        }
+
+    def _centre_of_mass(self, bodies: BodyStates) -> Tensor:
+        """Of the character, if its bodies were there, ``(N, 3)``."""
+        model, count = self.simulation.model, bodies.positions.shape[-2]
+        masses, centres = (torch.from_numpy(field[1 : 1 + count]) for field in (model.body_mass, model.body_ipos))
+        places = bodies.positions + rotate(bodies.orientations, centres)
+        return masses @ places / masses.sum()
+
+    def _exhausted(self) -> Tensor:
+        clips = self.episode["clip"]
+        ahead = self.episode["time"] + NUM_TARGETS * CONTROL_TIMESTEP
+        return ((ahead > self.library.durations[clips]) & ~self.library.loops[clips]).unsqueeze(-1)

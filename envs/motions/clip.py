@@ -1,0 +1,223 @@
+"""Motion clips: what a character's joints do over time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.joints import JointLayout, joint_layout
+from torchrl_mcp.envs.motions.placement import Placement, placing
+from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
+
+
+@dataclass(frozen=True, eq=False)
+class MotionClip:
+    """A trajectory of a character's root and joints at a constant frame rate.
+
+    The quaternions are kept normalised, with signs that make them continuous. A looping clip ends in the pose it begins
+    with; each further cycle begins at the place on the ground and with the heading in which the last one ended, while
+    height, roll and pitch start anew.
+
+    Args:
+        character: Name of the character.
+        qpos: States in MuJoCo's order for the character's model, shape ``(T, nq)``, float64, T >= 2: root position and
+            quaternion ``(w, x, y, z)``, then the joints in the order of the bodies. Not to be written to.
+        fps: Frames per second.
+        loop: Whether the motion repeats.
+
+    Raises:
+        ValueError: If the states are not of that shape, not finite or not rotations, or ``fps`` is not positive.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs.motions.joints import character_model
+        >>> gliding = torch.from_numpy(character_model("humanoid").qpos0).repeat(2, 1)
+        >>> gliding[1, 0] += 0.5
+        >>> clip = MotionClip("humanoid", gliding, fps=2.0, loop=True)
+        >>> clip.at(torch.tensor([0.25, 1.75]))[:, 0]
+        tensor([0.2500, 1.7500], dtype=torch.float64)
+    """
+
+    character: str
+    qpos: Tensor
+    fps: float
+    loop: bool = False
+
+    def __post_init__(self) -> None:
+        layout = self.layout
+        if self.qpos.ndim != 2 or self.qpos.shape[1] != layout.nq or len(self.qpos) < 2:
+            raise ValueError(f"qpos has shape {tuple(self.qpos.shape)}: pass (T, {layout.nq}) with T >= 2")
+        if not self.fps > 0:
+            raise ValueError(f"fps={self.fps} is no frame rate: pass a positive number")
+        qpos = self.qpos.detach().to("cpu", torch.float64, copy=True)
+        if not qpos.isfinite().all():
+            frame = int((~qpos.isfinite()).any(-1).nonzero()[0])
+            raise ValueError(f"qpos is not finite in frame {frame}: correct or remove it")
+        qpos[:, layout.quaternions] = _canonical(qpos[:, layout.quaternions])
+        object.__setattr__(self, "qpos", qpos)
+        object.__setattr__(self, "fps", float(self.fps))
+
+    @property
+    def layout(self) -> JointLayout:
+        """Which numbers of a state belong to which joint."""
+        return joint_layout(self.character)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last, of one cycle if it loops."""
+        return (len(self.qpos) - 1) / self.fps
+
+    @cached_property
+    def cycle(self) -> Placement:
+        """What one cycle of a loop does to the root's place on the ground."""
+        return placing(self.qpos[0], self.qpos[-1])
+
+    @cached_property
+    def qvel(self) -> Tensor:
+        """Velocities in MuJoCo's convention at every frame, shape ``(T, nv)``: means of the differences on both sides.
+
+        Linear velocity of the root in the world; angular velocities of the root and of ball joints in the frames of
+        their own bodies.
+        """
+        steps = differences(self.qpos, self.layout) * self.fps
+        before, after = steps[:1], steps[-1:]
+        if self.loop:
+            before, after = self.cycle.power(torch.tensor(-1)).qvel(steps[-1:]), self.cycle.qvel(steps[:1])
+        return (torch.cat([before, steps]) + torch.cat([steps, after])) / 2
+
+    def at(self, times: Tensor) -> Tensor:
+        """State at any time, shape ``(*B, nq)``: slerp for quaternions, linear for the rest.
+
+        Args:
+            times: Seconds since the first frame, shape ``(*B)``; held at the ends unless the clip loops.
+        """
+        frame, fraction, cycles = self._locate(times)
+        before, after, quaternions = self.qpos[frame], self.qpos[frame + 1], self.layout.quaternions
+        qpos = torch.lerp(before, after, fraction.unsqueeze(-1))
+        qpos[..., quaternions] = slerp(before[..., quaternions], after[..., quaternions], fraction.unsqueeze(-1))
+        return self.cycle.power(cycles).qpos(qpos) if self.loop else qpos
+
+    def velocity(self, times: Tensor) -> Tensor:
+        """Velocity at any time, shape ``(*B, nv)``, linear between those of the frames; see :attr:`qvel`."""
+        frame, fraction, cycles = self._locate(times)
+        qvel = torch.lerp(self.qvel[frame], self.qvel[frame + 1], fraction.unsqueeze(-1))
+        return self.cycle.power(cycles).qvel(qvel) if self.loop else qvel
+
+    def mirrored(self) -> Self:
+        """Exchange left and right, exactly: the mirror image of the mirror image is the clip."""
+        return replace(self, qpos=self.qpos[:, self.layout.mirror] * self.layout.mirror_sign)
+
+    def resampled(self, fps: float) -> Self:
+        """Return the clip at another frame rate, or the nearest one that divides its duration into whole frames."""
+        frames = max(1, round(self.duration * fps))
+        times = torch.linspace(0, self.duration, frames + 1, dtype=torch.float64)
+        return replace(self, qpos=self._within(times), fps=frames / self.duration)
+
+    def section(self, start: float, stop: float) -> Self:
+        """Return the part between two times, in seconds, as a clip that does not loop.
+
+        Raises:
+            ValueError: If the part is empty or lies outside the clip.
+        """
+        if not 0 <= start < stop <= self.duration + 1e-9:
+            raise ValueError(
+                f"start={start}, stop={stop} is no part of the clip: pass 0 <= start < stop <= {self.duration:g}"
+            )
+        frames = max(1, round((stop - start) * self.fps))
+        times = start + torch.arange(frames + 1, dtype=torch.float64) / self.fps
+        return replace(self, qpos=self._within(times), loop=False)
+
+    def placed(self, placement: Placement) -> Self:
+        """Carry the clip to another place and direction on the ground."""
+        return replace(self, qpos=placement.qpos(self.qpos))
+
+    def save(self, path: str | Path) -> None:
+        """Write a NumPy archive (``.npz``) of plain arrays: numbers keep every bit, and reading runs no code."""
+        joints = np.array(self.layout.names)
+        np.savez_compressed(
+            path, character=self.character, joints=joints, qpos=self.qpos.numpy(), fps=self.fps, loop=self.loop
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            ValueError: If the file is no clip, or its joints are not those of the character's model.
+        """
+        with np.load(path, allow_pickle=False) as archive:
+            if missing := {"character", "joints", "qpos", "fps", "loop"} - set(archive):
+                raise ValueError(f"path={str(path)!r} is no motion clip, it lacks {sorted(missing)}: pass a saved clip")
+            arrays = dict(archive)
+        character, joints = str(arrays["character"]), tuple(map(str, arrays["joints"]))
+        if joints != (expected := joint_layout(character).names):
+            raise ValueError(
+                f"path={str(path)!r} has the joints {joints}, and {character}'s model has {expected}: "
+                "make the clip anew for this model"
+            )
+        return cls(character, torch.from_numpy(arrays["qpos"]), float(arrays["fps"]), loop=bool(arrays["loop"]))
+
+    def _locate(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Frame before each time, fraction of the way to the next, and number of cycles completed."""
+        cycles = torch.floor(times / self.duration) if self.loop else torch.zeros_like(times)
+        position = ((times - cycles * self.duration).double() * self.fps).clamp(0, len(self.qpos) - 1)
+        frame = position.long().clamp(max=len(self.qpos) - 2)
+        return frame, position - frame, cycles.double()
+
+    def _within(self, times: Tensor) -> Tensor:
+        """State at times within the first cycle, the end included."""
+        return replace(self, loop=False).at(times)
+
+
+def concatenated(clips: Sequence[MotionClip]) -> MotionClip:
+    """Play clips one after another, each beginning at the place and in the direction in which the last one ended.
+
+    The first frame of a clip is taken for the last of the one before: their poses should agree.
+
+    Args:
+        clips: One or more, of one character and frame rate.
+
+    Raises:
+        ValueError: If there are none, or they differ in character or frame rate.
+    """
+    if len({(clip.character, clip.fps) for clip in clips}) != 1:
+        kinds = sorted({f"{clip.character} at {clip.fps:g} fps" for clip in clips})
+        raise ValueError(
+            f"clips are of {kinds or 'no kind'}: pass at least one, all of one character, and resample them"
+        )
+    first, *others = clips
+    parts = [first.qpos]
+    for clip in others:
+        parts.append(placing(clip.qpos[0], parts[-1][-1]).qpos(clip.qpos[1:]))
+    return replace(first, qpos=torch.cat(parts), loop=False)
+
+
+def differences(qpos: Tensor, layout: JointLayout) -> Tensor:
+    """Changes from each state to the next in MuJoCo's convention, as ``mj_differentiatePos``, shape ``(T - 1, nv)``.
+
+    Args:
+        qpos: States, shape ``(T, nq)``.
+        layout: Of the character.
+    """
+    before, after = qpos[:-1], qpos[1:]
+    change = qpos.new_empty(len(qpos) - 1, layout.nv)
+    change[:, :3] = after[:, :3] - before[:, :3]
+    change[:, layout.rates] = after[:, layout.angles] - before[:, layout.angles]
+    turned = multiply(inverse(before[:, layout.quaternions]), after[:, layout.quaternions])
+    change[:, layout.spins] = to_rotation_vector(turned)
+    return change
+
+
+def _canonical(quaternions: Tensor) -> Tensor:
+    """Normalise and make continuous, shape ``(T, Q, 4)``; what is so already keeps every bit."""
+    norm = torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True)
+    if (norm < 0.5).any():
+        frame = int((norm < 0.5).flatten(1).any(-1).nonzero()[0])
+        raise ValueError(f"qpos has a quaternion of length {norm.min():g} in frame {frame}: pass unit quaternions")
+    scale = torch.where((norm - 1).abs() < 1e-12, torch.ones_like(norm), norm)
+    return continuous((quaternions / scale).transpose(0, 1)).transpose(0, 1)

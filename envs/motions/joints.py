@@ -1,0 +1,97 @@
+"""Where a character's joints are in MuJoCo's ``qpos`` and ``qvel``."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import mujoco
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.characters import CHARACTERS
+
+
+@cache
+def character_model(character: str) -> mujoco.MjModel:
+    """Compile a character alone, without floor; shared, so not to be changed.
+
+    Raises:
+        ValueError: If there is no such character.
+    """
+    if character not in CHARACTERS:
+        raise ValueError(f"character={character!r} does not exist: pass one of {sorted(CHARACTERS)}")
+    return CHARACTERS[character].spec().compile()
+
+
+@dataclass(frozen=True, eq=False)
+class JointLayout:
+    """A character's joints by name, and which numbers of a state are theirs.
+
+    Args:
+        names: Joints in the order of the bodies, the free joint of the root first.
+        nq: Length of ``qpos``.
+        nv: Length of ``qvel``.
+        quaternions: Indices in ``qpos`` of the quaternions, the root's first, shape ``(Q, 4)``, int64.
+        spins: Indices in ``qvel`` of their angular velocities, shape ``(Q, 3)``, int64.
+        angles: Indices in ``qpos`` of the hinges, shape ``(H,)``, int64.
+        rates: Indices in ``qvel`` of their velocities, shape ``(H,)``, int64.
+        mirror: Index in ``qpos`` of what takes each number's place in the mirror image, shape ``(nq,)``, int64.
+        mirror_sign: Its sign there, shape ``(nq,)``, float64.
+    """
+
+    names: tuple[str, ...]
+    nq: int
+    nv: int
+    quaternions: Tensor
+    spins: Tensor
+    angles: Tensor
+    rates: Tensor
+    mirror: Tensor
+    mirror_sign: Tensor
+
+
+@cache
+def joint_layout(character: str) -> JointLayout:
+    """Read the layout of a character from its model."""
+    model = character_model(character)
+    names = tuple(model.joint(index).name for index in range(model.njnt))
+    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    offsets = torch.from_numpy((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) * 3)[~hinges]
+    positions, velocities = torch.from_numpy(model.jnt_qposadr).long(), torch.from_numpy(model.jnt_dofadr).long()
+    mirror, mirror_sign = _mirror(model, names)
+    return JointLayout(
+        names=names,
+        nq=model.nq,
+        nv=model.nv,
+        quaternions=(positions[~hinges] + offsets).unsqueeze(-1) + torch.arange(4),
+        spins=(velocities[~hinges] + offsets).unsqueeze(-1) + torch.arange(3),
+        angles=positions[hinges],
+        rates=velocities[hinges],
+        mirror=mirror,
+        mirror_sign=mirror_sign,
+    )
+
+
+def twin(name: str) -> str:
+    """Name of the same part on the other side of the body; a part in the middle is its own twin."""
+    for side, other in (("left_", "right_"), ("right_", "left_")):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name
+
+
+def _mirror(model: mujoco.MjModel, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
+    """Reflect y: a position changes y; a rotation, being a pseudo-vector, x and z; left and right change places."""
+    source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
+    for joint, name in enumerate(names):
+        here, there = model.jnt_qposadr[joint], model.joint(twin(name)).qposadr[0]
+        match model.jnt_type[joint]:
+            case mujoco.mjtJoint.mjJNT_FREE:
+                signs = [1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
+            case mujoco.mjtJoint.mjJNT_BALL:
+                signs = [1.0, -1.0, 1.0, -1.0]
+            case _:
+                axis, other = model.joint(name).axis, model.joint(twin(name)).axis
+                signs = [float(axis[1] * other[1] - axis[0] * other[0] - axis[2] * other[2])]
+        source[here : here + len(signs)] = torch.arange(there, there + len(signs))
+        sign[here : here + len(signs)] = torch.tensor(signs, dtype=torch.float64).round()
+    return source, sign

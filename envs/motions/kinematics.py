@@ -1,0 +1,57 @@
+"""Where a character's bodies are, by MuJoCo's forward kinematics."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.joints import character_model
+
+
+class BodyStates(NamedTuple):
+    """The L bodies of a character, the root first, in world coordinates.
+
+    Args:
+        positions: Of the bodies' origins, shape ``(*B, L, 3)``, in metres.
+        orientations: Unit quaternions (w, x, y, z), shape ``(*B, L, 4)``.
+        linear_velocities: Of the bodies' origins, shape ``(*B, L, 3)``, in m/s.
+        angular_velocities: Shape ``(*B, L, 3)``, in rad/s.
+    """
+
+    positions: Tensor
+    orientations: Tensor
+    linear_velocities: Tensor
+    angular_velocities: Tensor
+
+
+def body_names(character: str) -> list[str]:
+    """Names of a character's bodies, the root first."""
+    model = character_model(character)
+    return [model.body(index).name for index in range(1, model.nbody)]
+
+
+def body_states(character: str, qpos: Tensor, qvel: Tensor) -> BodyStates:
+    """Positions and velocities of all bodies in each of T states.
+
+    Args:
+        character: Name of the character.
+        qpos: Shape ``(T, nq)``.
+        qvel: Shape ``(T, nv)``.
+    """
+    model = character_model(character)
+    data = mujoco.MjData(model)
+    frames = len(qpos)
+    positions, orientations = np.empty((frames, model.nbody, 3)), np.empty((frames, model.nbody, 4))
+    twists, centres = np.empty((frames, model.nbody, 6)), np.empty((frames, 1, 3))
+    for frame, (data.qpos, data.qvel) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        positions[frame], orientations[frame] = data.xpos, data.xquat
+        twists[frame], centres[frame] = data.cvel, data.subtree_com[1]
+    angular = twists[..., :3]
+    # MuJoCo gives the velocity of the point of the body that is at the character's centre of mass.
+    linear = twists[..., 3:] + np.cross(angular, positions - centres)
+    return BodyStates(*(torch.from_numpy(field[:, 1:]) for field in (positions, orientations, linear, angular)))

@@ -1,0 +1,161 @@
+"""Many motion clips, looked up in one batch."""
+
+import hashlib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.joints import joint_layout
+from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names, body_states
+from torchrl_mcp.envs.motions.placement import Placement, placing
+from torchrl_mcp.envs.rotations import continuous
+
+
+class MotionState(NamedTuple):
+    """Moments of reference motions.
+
+    Args:
+        qpos: States of the character, shape ``(N, nq)``.
+        qvel: Their velocities in MuJoCo's convention, shape ``(N, nv)``.
+        bodies: The bodies in world coordinates, each ``(N, L, ...)``.
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    bodies: BodyStates
+
+    def placed(self, placement: Placement) -> "MotionState":
+        """Carry every moment to another place and direction on the ground, N turns and shifts."""
+        each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
+        bodies = BodyStates(
+            positions=each.points(self.bodies.positions),
+            orientations=each.quaternions(self.bodies.orientations),
+            linear_velocities=each.vectors(self.bodies.linear_velocities),
+            angular_velocities=each.vectors(self.bodies.angular_velocities),
+        )
+        return MotionState(placement.qpos(self.qpos), placement.qvel(self.qvel), bodies)
+
+
+class MotionLibrary:
+    """Clips of one character as one table of frames, from which moments of many clips are read at once.
+
+    Between frames every number is interpolated linearly and quaternions are normalised again: at 30 frames per second
+    or more, and at a walker's speeds, within a thousandth of a radian of :meth:`MotionClip.at`.
+
+    Args:
+        clips: Clips of one character, by name.
+        weights: How often each clip is drawn relative to the others, by name; None draws each moment equally often, so
+            that the weight of a clip is its duration.
+        dtype: Of all that is read.
+
+    Raises:
+        ValueError: If there are no clips, they are of several characters, or the weights do not fit them.
+    """
+
+    def __init__(
+        self,
+        clips: Mapping[str, MotionClip],
+        weights: Mapping[str, float] | None = None,
+        *,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        if len(characters := sorted({clip.character for clip in clips.values()})) != 1:
+            raise ValueError(f"clips are of {characters or 'no character'}: pass one or more, all of one character")
+        self.character, self.names = characters[0], list(clips)
+        self.body_names = body_names(self.character)
+        self.durations = torch.tensor([clip.duration for clip in clips.values()], dtype=torch.float64)
+        """Seconds, of one cycle where a clip loops, shape ``(C,)``."""
+        self.loops = torch.tensor([clip.loop for clip in clips.values()])
+        """Shape ``(C,)``, bool."""
+        self.weights = self.durations if weights is None else self._checked(weights)
+        """Relative to their sum, the probability of each clip, shape ``(C,)``."""
+        self.digest = _digest(clips, self.weights)
+        """SHA-256 of clips and weights, by which a checkpoint knows what it was trained on."""
+        self._fps = torch.tensor([clip.fps for clip in clips.values()], dtype=torch.float64)
+        lengths = torch.tensor([len(clip.qpos) for clip in clips.values()])
+        self._last, self._start = lengths - 1, lengths.cumsum(0) - lengths
+        first = torch.stack([clip.qpos[0] for clip in clips.values()])
+        self._cycles = placing(first, torch.stack([clip.qpos[-1] for clip in clips.values()]))
+        layout = joint_layout(self.character)
+        self._order = torch.cat([layout.quaternions.mT.flatten(), torch.arange(3), layout.angles]).argsort()
+        self._num_turns = len(layout.quaternions)
+        rows = [_rows(clip) for clip in clips.values()]
+        self._table = torch.cat([torch.cat(row, dim=-1) for row in rows]).to(dtype)
+        self._sizes = [part.shape[-1] for part in rows[0]]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def at(self, clips: Tensor, times: Tensor) -> MotionState:
+        """Read moments of clips.
+
+        Args:
+            clips: Index of each clip, shape ``(N,)``, int64.
+            times: Seconds since its first frame, shape ``(N,)``; held at the ends unless the clip loops.
+        """
+        last = self._last[clips]
+        frames = times.double() * self._fps[clips]
+        cycles = torch.where(self.loops[clips], torch.floor(frames / last), 0.0)
+        frames = torch.minimum((frames - cycles * last).clamp_min(0.0), last)
+        whole = torch.minimum(frames.long(), last - 1)
+        rows, fraction = self._start[clips] + whole, (frames - whole).to(self._table.dtype)
+        before, after = self._table.index_select(0, rows), self._table.index_select(0, rows + 1)
+        moments = torch.lerp(before, after, fraction.unsqueeze(-1)).split(self._sizes, dim=-1)
+        quaternions = moments[0].unflatten(-1, (4, -1))
+        quaternions *= quaternions.square().sum(-2, keepdim=True).rsqrt()
+        joints = torch.cat([quaternions[..., : self._num_turns].flatten(1), moments[1]], dim=-1)
+        qpos = joints.index_select(1, self._order)
+        orientations = quaternions[..., self._num_turns :].mT
+        positions, linear, angular = (part.unflatten(-1, (3, -1)).mT for part in moments[2:5])
+        state = MotionState(qpos, moments[5], BodyStates(positions, orientations, linear, angular))
+        if not cycles.any():
+            return state
+        cycle = Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles)
+        return state.placed(Placement(*(part.to(self._table.dtype) for part in cycle)))
+
+    def sample(self, num: int, generator: torch.Generator, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Draw moments: clips by their weights, times evenly over a clip or a cycle of it.
+
+        Args:
+            num: How many.
+            generator: Source of randomness.
+            weights: To use instead of :attr:`weights`, shape ``(C,)``.
+
+        Returns:
+            Clips, shape ``(num,)``, int64, and times in seconds, shape ``(num,)``, float64.
+        """
+        weights = self.weights if weights is None else weights
+        clips = torch.multinomial(weights, num, replacement=True, generator=generator)
+        return clips, torch.rand(num, generator=generator, dtype=torch.float64) * self.durations[clips]
+
+    def _checked(self, weights: Mapping[str, float]) -> Tensor:
+        if set(weights) != set(self.names):
+            raise ValueError(f"weights are of {sorted(weights)}: pass one for each of the clips {self.names}")
+        values = torch.tensor([weights[name] for name in self.names], dtype=torch.float64)
+        if not (values >= 0).all() or not 0 < values.sum() < torch.inf:
+            raise ValueError(f"weights={dict(weights)}: pass finite numbers of at least 0, not all of them 0")
+        return values
+
+
+def _rows(clip: MotionClip) -> list[Tensor]:
+    """All that is known of every frame, each ``(T, *)``.
+
+    Quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, ``qvel``. Vectors and
+    quaternions are stored component by component, which is several times as fast as body by body.
+    """
+    layout, bodies = clip.layout, body_states(clip.character, clip.qpos, clip.qvel)
+    turns = continuous(torch.cat([clip.qpos[:, layout.quaternions], bodies.orientations], dim=1).transpose(0, 1))
+    others = torch.cat([clip.qpos[:, :3], clip.qpos[:, layout.angles]], dim=-1)
+    vectors = (bodies.positions, bodies.linear_velocities, bodies.angular_velocities)
+    return [turns.permute(1, 2, 0).flatten(1), others, *(vector.mT.flatten(1) for vector in vectors), clip.qvel]
+
+
+def _digest(clips: Mapping[str, MotionClip], weights: Tensor) -> str:
+    digest = hashlib.sha256(repr(weights.tolist()).encode())
+    for name, clip in clips.items():
+        digest.update(repr((name, clip.character, clip.layout.names, clip.fps, clip.loop, clip.qpos.shape)).encode())
+        digest.update(clip.qpos.numpy().tobytes())
+    return digest.hexdigest()

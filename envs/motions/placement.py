@@ -1,0 +1,74 @@
+"""Rigid motions of the ground plane, which carry a motion to another place and direction."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.rotations import about_z, heading, multiply
+
+
+class Placement(NamedTuple):
+    r"""A turn about the vertical through the origin, then a shift: :math:`p \mapsto R_z(\psi) p + s`.
+
+    Args:
+        turn: Angle :math:`\psi`, shape ``(*B)``, in radians.
+        shift: Horizontal displacement :math:`s`, shape ``(*B, 2)``, in metres.
+    """
+
+    turn: Tensor
+    shift: Tensor
+
+    def vectors(self, vectors: Tensor) -> Tensor:
+        """Turn directions or velocities, shape ``(*B, 3)``."""
+        cosine, sine = self.turn.cos(), self.turn.sin()
+        x, y, z = torch.broadcast_tensors(*vectors.unbind(-1), cosine)[:3]
+        return torch.stack([cosine * x - sine * y, sine * x + cosine * y, z]).movedim(0, -1)
+
+    def points(self, points: Tensor) -> Tensor:
+        """Turn and shift points, shape ``(*B, 3)``."""
+        turned = self.vectors(points)
+        return torch.cat([turned[..., :2] + self.shift, turned[..., 2:]], dim=-1)
+
+    def quaternions(self, quaternions: Tensor) -> Tensor:
+        """Turn orientations, shape ``(*B, 4)``."""
+        return multiply(about_z(self.turn), quaternions)
+
+    def qpos(self, qpos: Tensor) -> Tensor:
+        """Place states of a character, shape ``(*B, nq)``: its root moves, its joints stay as they are."""
+        return torch.cat([self.points(qpos[..., :3]), self.quaternions(qpos[..., 3:7]), qpos[..., 7:]], dim=-1)
+
+    def qvel(self, qvel: Tensor) -> Tensor:
+        """Place velocities of a character, shape ``(*B, nv)``: all but the root's are relative to its own bodies."""
+        return torch.cat([self.vectors(qvel[..., :3]), qvel[..., 3:]], dim=-1)
+
+    def after(self, first: "Placement") -> "Placement":
+        """Return the placement that does ``first``, then this one."""
+        shift = torch.cat([first.shift, torch.zeros_like(first.shift[..., :1])], dim=-1)
+        return Placement(self.turn + first.turn, self.points(shift)[..., :2])
+
+    def power(self, times: Tensor) -> "Placement":
+        r"""Return the placement done k times over, k an integer of either sign, shape ``(*B)``.
+
+        .. math:: \sum_{j<k} R_z(j \psi) s = \frac{\sin (k \psi / 2)}{\sin (\psi / 2)} R_z(\tfrac{k - 1}{2} \psi) s
+        """
+        half = self.turn / (2 * torch.pi)
+        length = times * torch.sinc(times * half) / torch.sinc(half)
+        direction = (times - 1) / 2 * self.turn
+        cosine, sine = length * direction.cos(), length * direction.sin()
+        x, y = self.shift.unbind(-1)
+        return Placement(times * self.turn, torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1))
+
+
+def placing(start: Tensor, end: Tensor) -> Placement:
+    """Return the placement that carries a root's ground position and heading from one to another, angle in (-pi, pi].
+
+    Args:
+        start: Root position and quaternion before, shape ``(*B, >= 7)``: states ``qpos`` will do.
+        end: Root position and quaternion after, shape ``(*B, >= 7)``.
+    """
+    angle = heading(end[..., 3:7]) - heading(start[..., 3:7])
+    turn = torch.atan2(angle.sin(), angle.cos())
+    return Placement(
+        turn, end[..., :2] - Placement(turn, torch.zeros_like(end[..., :2])).points(start[..., :3])[..., :2]
+    )

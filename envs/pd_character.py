@@ -1,0 +1,209 @@
+"""Characters under PD control, and what their tasks share: the state, falls and the scene."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.base import CharacterEnv
+from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.observations import character_state, state_layout
+from torchrl_mcp.envs.rotations import heading
+
+CONTROL_TIMESTEP = 1 / 30
+"""Seconds per action."""
+
+
+class PDCharacterEnv(CharacterEnv):
+    r"""A character that follows target poses, on flat ground.
+
+    ``action``, in [-1, 1], scales to the targets of the PD controllers: exponential maps for ball joints and angles for
+    hinges. Zero is the rest pose, standing upright; 1 is half the width of the range that the target may have, which
+    clips it. ``observation`` is :func:`~torchrl_mcp.envs.observations.character_state`, whose entries
+    ``observation_layout`` names.
+
+    The character *falls* when any body but its feet touches the ground. That ends the episode; the reward of the fall
+    is 0.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
+        episode: What the task remembers of one simulation at first, beside ``com``, the centre of mass.
+        furnish: Adds what the task needs to the scene, after character, ground and light.
+        physics_timestep: Seconds, a whole fraction of 1/30; None is the character's own choice.
+        self_collision: Let bodies of the character collide with one another.
+        terminate_on_fall: End the episode of a fallen character.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.base.CharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        max_episode_steps: int,
+        episode: Mapping[str, Tensor],
+        furnish: Callable[[mujoco.MjSpec], None] = lambda spec: None,
+        physics_timestep: float | None = None,
+        self_collision: bool = False,
+        terminate_on_fall: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        if character not in CHARACTERS:
+            raise ValueError(f"character={character!r} is unknown: pass one of {', '.join(CHARACTERS)}")
+        self.character = CHARACTERS[character]
+        spec = self.character.spec(self_collision=self_collision)
+        self._bodies = [body.name for body in spec.bodies[1:]]
+        add_ground(spec)
+        furnish(spec)
+        if physics_timestep is not None:
+            spec.option.timestep = physics_timestep
+        substeps = round(CONTROL_TIMESTEP / spec.option.timestep)
+        if substeps < 1 or not math.isclose(substeps * spec.option.timestep, CONTROL_TIMESTEP, rel_tol=1e-6):
+            raise ValueError(
+                f"physics_timestep={spec.option.timestep} does not divide the control step of 1/30 s: pass 1/30 "
+                "divided by a whole number, such as 1/120"
+            )
+        model = spec.compile()
+        self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5])
+        self._falling = falling_geoms(model, self.character.feet, len(self._bodies))
+        super().__init__(
+            model,
+            num_envs,
+            substeps=substeps,
+            max_episode_steps=max_episode_steps,
+            episode={"com": torch.zeros(3, dtype=torch.float64), **episode},
+            outputs=["xpos", "xquat", "cvel", "subtree_com", "geom_xpos", "geom_xmat"],
+            persistent=True,
+            current=True,
+            **kwargs,
+        )
+        self.terminate_on_fall = terminate_on_fall
+        self.observation_layout = state_layout(self._bodies)
+        """Where to find each quantity in ``observation``, by name."""
+        # Live views, made once. The character's bodies follow the world, which is body 0.
+        bodies, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
+        self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
+        self._twists, self._com = outputs["cvel"][:, bodies], outputs["subtree_com"][:, 1]
+
+    def heading(self) -> Tensor:
+        """Direction that each character faces, in radians from the world's x axis, shape ``(N,)``, float64."""
+        return heading(self._orientations[:, 0])
+
+    def fallen(self) -> Tensor:
+        """Whether a body other than the feet touches the ground, shape ``(N,)``, bool."""
+        geoms, half_sizes, radii = self._falling
+        centres = self.simulation.outputs["geom_xpos"][:, geoms, 2]
+        vertical = self.simulation.outputs["geom_xmat"][:, geoms, 6:]
+        return (lowest_points(centres, vertical, half_sizes, radii) < 0).any(-1)
+
+    def _com_velocity(self) -> Tensor:
+        """Horizontal displacement of the centre of mass in the step just made, per second, ``(N, 2)``."""
+        velocity = (self._com - self.episode["com"])[:, :2] / self.control_timestep
+        self.episode["com"].copy_(self._com)
+        return velocity
+
+    def _unless_fallen(self, reward: Tensor) -> tuple[Tensor, Tensor]:
+        """The reward, or 0 after a fall, and whether the fall ends the episode, ``(N,)`` each."""
+        fallen = self.fallen()
+        return reward.masked_fill(fallen, 0.0), fallen & self.terminate_on_fall
+
+    def _body_states(self) -> BodyStates:
+        """The character's bodies in the world, as observed: in ``dtype``."""
+        angular, linear = self._twists.split(3, -1)
+        # MuJoCo gives the velocity of the point of each body that passes the character's centre of mass.
+        linear = linear + torch.linalg.cross(angular, self._positions - self._com.unsqueeze(1))
+        parts = (self._positions, self._orientations, linear, angular)
+        return BodyStates(*(part.to(self._dtype) for part in parts))
+
+    def _state(self, angle: Tensor) -> Tensor:
+        """State s of each character, whose root has the heading ``angle``, ``(N, S)``."""
+        return character_state(angle.to(self._dtype), self._body_states())
+
+    def _action_bounds(self) -> Tensor:
+        return torch.tensor([-1.0, 1.0]).expand(len(self._scale), 2)
+
+    def _controls(self, action: Tensor) -> Tensor:
+        return action * self._scale
+
+    def _sample(self, num: int) -> dict[str, Tensor]:
+        model = self.simulation.model
+        qpos = torch.from_numpy(model.qpos0).repeat(num, 1)
+        return {"qpos": qpos, "qvel": torch.zeros(num, model.nv, dtype=torch.float64)}
+
+    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
+        return {"com": self._com[ids]}
+
+
+def add_ground(spec: mujoco.MjSpec) -> None:
+    """Add flat ground and light to a character's scene."""
+    spec.add_texture(
+        name="ground",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        width=256,
+        height=256,
+        rgb1=[0.62, 0.66, 0.70],
+        rgb2=[0.70, 0.74, 0.78],
+    )
+    material = spec.add_material(name="ground", texrepeat=[0.5, 0.5], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
+    spec.worldbody.add_geom(
+        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground", contype=1, conaffinity=1
+    )
+    spec.worldbody.add_light(
+        name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 10], dir=[-0.3, 0.4, -1]
+    )
+
+
+def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The shapes that must not touch the ground: all that collide, of all bodies but the feet.
+
+    Returns:
+        Their ids ``(G,)``, half-sizes ``(G, 3)`` and radii ``(G,)`` for :func:`lowest_points`.
+    """
+    owners = torch.tensor(model.geom_bodyid)
+    others = torch.tensor([model.body(body).id for body in feet])
+    collides = torch.tensor(model.geom_contype | model.geom_conaffinity) != 0
+    ids = ((owners > 0) & (owners <= num_bodies) & collides & ~torch.isin(owners, others)).nonzero().squeeze(-1)
+    kinds = [mujoco.mjtGeom(kind) for kind in model.geom_type[ids]]
+    half_sizes, radii = torch.zeros(len(ids), 3, dtype=torch.float64), torch.zeros(len(ids), dtype=torch.float64)
+    for row, (kind, size) in enumerate(zip(kinds, torch.tensor(model.geom_size)[ids], strict=True)):
+        match kind:
+            case mujoco.mjtGeom.mjGEOM_SPHERE:
+                radii[row] = size[0]
+            case mujoco.mjtGeom.mjGEOM_CAPSULE:
+                radii[row], half_sizes[row, 2] = size[0], size[1]
+            case mujoco.mjtGeom.mjGEOM_BOX:
+                half_sizes[row] = size
+            case _:
+                raise ValueError(f"a character has a colliding {kind.name}: use spheres, capsules and boxes")
+    return ids, half_sizes, radii
+
+
+def lowest_points(heights: Tensor, vertical: Tensor, half_sizes: Tensor, radii: Tensor) -> Tensor:
+    r"""Height of the lowest point of spheres, capsules and boxes.
+
+    .. math:: z - r - \sum_i |R_{3i}| h_i
+
+    Each is the set of points within a radius :math:`r` of a box of half-sizes :math:`h`, turned by :math:`R`: a sphere
+    has no box, a capsule one without width, and a box no radius.
+
+    Args:
+        heights: Of the centres, z, in metres, shape ``(*B, G)``.
+        vertical: The last row of each rotation matrix, shape ``(*B, G, 3)``.
+        half_sizes: In metres, shape ``(G, 3)``.
+        radii: In metres, shape ``(G,)``.
+
+    Returns:
+        Shape ``(*B, G)``, in metres.
+    """
+    return heights - radii - (vertical.abs() * half_sizes).sum(-1)

@@ -1,0 +1,52 @@
+"""How well a character follows a reference motion, as functions of tensors."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Term(NamedTuple):
+    """A term of the imitation reward, :math:`w \\exp(-c \\, e)` of an error :math:`e`."""
+
+    weight: float
+    scale: float
+
+
+def tracking_reward(errors: Mapping[str, Tensor], terms: Mapping[str, Term]) -> Tensor:
+    r"""Reward of motion imitation: how close the character is to the reference in several respects.
+
+    .. math:: r = \sum_i w_i \exp(-c_i e_i)
+
+    Args:
+        errors: Errors :math:`e_i` by name, each of shape ``(*B)``.
+        terms: Weights :math:`w_i` and scales :math:`c_i` by the names of errors.
+
+    Returns:
+        Reward, shape ``(*B)``.
+
+    Reference:
+        Peng et al., *DeepMimic: Example-Guided Deep Reinforcement Learning of Physics-Based Character Skills*, 2018,
+        section 5.2.
+    """
+    return torch.stack([term.weight * (-term.scale * errors[name]).exp() for name, term in terms.items()]).sum(0)
+
+
+def squared_angles(one: Tensor, other: Tensor) -> Tensor:
+    r"""Squared angles between rotations, :math:`(2 \arccos |q \cdot \hat{q}|)^2`.
+
+    Args:
+        one: Unit quaternions, shape ``(*B, 4)``.
+        other: Unit quaternions, shape ``(*B, 4)``.
+
+    Returns:
+        Shape ``(*B)``, in squared radians.
+    """
+    chord = torch.minimum((one - other).square().sum(-1), (one + other).square().sum(-1)).sqrt()
+    return (4 * torch.asin((chord / 2).clamp(max=1.0))).square()  # unlike acos exact for small angles
+
+
+def squared_distances(one: Tensor, other: Tensor) -> Tensor:
+    """Squared distances between points, shape ``(*B, D)`` each, to ``(*B)``."""
+    return (one - other).square().sum(-1)

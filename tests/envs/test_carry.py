@@ -1,0 +1,280 @@
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from torchrl_mcp.envs import Carry
+from torchrl_mcp.envs.characters import BIPED, CHARACTERS
+
+FRONT = 0.065  # half-thickness of the biped's torso, a box
+HALF_SIZE = 0.15  # of the box
+GRAVITY = 9.81
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
+
+
+def make(num_envs=2, character="biped", **kwargs):
+    return Carry(character, num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
+
+
+def ahead(env, gap, height=0.0):
+    """A state in which the source with the box is ``gap`` in front of the biped's torso, the target far away."""
+    env.reset()
+    state = env.get_state()
+    place = torch.tensor([FRONT + gap + HALF_SIZE, 0.0])
+    state["qpos"][:, -7:-5], state["mocap_pos"][:, 1, :2] = place, place
+    state["mocap_pos"][:, 0, :2] = torch.tensor([-5.0, 0.0])
+    state["qpos"][:, -4:] = state["mocap_quat"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    state["qpos"][:, -5] += height
+    return state
+
+
+def play(env, carrier, num_steps, action=None):
+    for _ in range(num_steps):
+        carrier = env.step(carrier.set("action", torch.zeros(env.action_spec.shape) if action is None else action))
+        carrier = carrier["next"]
+    return carrier
+
+
+def joined(env):
+    return env.simulation.state["eq_active"].flatten().tolist()
+
+
+def holding(env):
+    """The state after the torso has taken the box."""
+    play(env, env.reset(ahead(env, -0.002), set_state=True), 1)
+    assert joined(env) == [1.0] * env.num_envs
+    return env.get_state()
+
+
+def held_pose(env, index=0):
+    """Place and orientation of the box as the torso sees it."""
+    data = env.simulation.data(index)
+    torso, box = data.body("torso"), data.body("box")
+    turn = torso.xmat.reshape(3, 3).T
+    return turn @ (box.xpos - torso.xpos), turn @ box.xmat.reshape(3, 3)
+
+
+def force_on_the_ground(env, index=0):
+    """Sum of MuJoCo's contact forces on the plane, upwards, in N."""
+    data, model, force = env.simulation.data(index), env.simulation.model, np.zeros(6)
+    total = 0.0
+    for number, contact in enumerate(data.contact):
+        if model.geom("ground").id in contact.geom:
+            mujoco.mj_contactForce(model, data, number, force)
+            total += force[0]
+    return total
+
+
+@pytest.mark.parametrize(("gap", "taken"), [(-0.002, 1.0), (0.002, 0.0)])
+def test_the_torso_takes_the_box_by_touching_it(gap, taken):
+    env = make()
+    play(env, env.reset(ahead(env, gap), set_state=True), 1)
+    assert joined(env) == [taken] * 2
+
+
+@pytest.mark.parametrize("character", CHARACTERS)
+def test_every_character_can_take_the_box_by_walking_up_to_it(character):
+    env = make(1, character, terminate_on_fall=False)
+    env.reset()
+    state, data = env.get_state(), env.simulation.data(0)
+    carrier = data.body(env.character.carrier)
+    place = torch.from_numpy(carrier.xipos.copy())
+    assert state["qpos"][0, -5].item() == pytest.approx(carrier.xipos[2])
+    state["qpos"][:, -7:-5] = state["mocap_pos"][:, 1, :2] = place[:2] + torch.tensor([0.0, -0.15])
+    state["mocap_pos"][:, 0, :2] = torch.tensor([-5.0, 0.0])
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [1.0]
+
+
+def test_other_bodies_do_not_take_the_box():
+    env = make()
+    state = ahead(env, 0.05)
+    state["qpos"][:, 7:11] = torch.tensor([math.cos(0.2), 0.0, -math.sin(0.2), 0.0])  # leans back at the waist
+    state["qpos"][:, -7] = state["mocap_pos"][:, 1, 0] = 0.06 + 0.15 - 0.003
+    state["qpos"][:, -5] -= 0.1
+    state["mocap_pos"][:, 1, 2] -= 0.1
+    env.reset(state, set_state=True)
+    names = [env.simulation.model.body(env.simulation.model.geom_bodyid[g]).name for g in contacts(env)]
+    assert "root" in names
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [0.0, 0.0]
+
+
+def contacts(env):
+    """Shapes in contact with the box."""
+    box = env.simulation.model.geom("box").id
+    return [geom for pair in env.simulation.data(0).contact.geom if box in pair for geom in pair if geom != box]
+
+
+def test_the_joint_closes_without_a_jump():
+    env, free = make(1), make(1)
+    state = ahead(env, -0.001)
+    angle = Rotation.from_euler("z", 0.02).as_quat()[[3, 0, 1, 2]]
+    state["qpos"][:, -4:] = torch.from_numpy(angle)
+    one, other = env.reset(state.clone(), set_state=True), free.reset(state, set_state=True)
+    free.episode["taken"].fill_(1)
+    one, other = play(env, one, 1), play(free, other, 1)
+    assert joined(env) == [1.0]
+    assert joined(free) == [0.0]
+    assert torch.equal(env.simulation.state["qpos"], free.simulation.state["qpos"])
+    place, turn = held_pose(env)
+    play(env, one, 1)
+    play(free, other, 1)
+    moved = env.simulation.state["qpos"] - free.simulation.state["qpos"]
+    assert moved.abs().max() < 1e-3
+    for _ in range(20):
+        play(env, one, 1)
+        now, turned = held_pose(env)
+        assert np.linalg.norm(now - place) < 1e-3
+        assert np.abs(turned - turn).max() < 1e-3
+
+
+def test_the_weight_of_the_box_is_felt_while_it_is_held():
+    env = make(2)
+    state = holding(env)
+    state["mocap_pos"][:, 1, 0] += 5  # the table is taken away
+    state["eq_active"][1] = 0
+    state["qpos"][1, -7] += 5  # the second character stands there without the box
+    carrier = env.reset(state, set_state=True)
+    forces = []
+    for _ in range(30):
+        carrier = play(env, carrier, 1)
+        forces.append([force_on_the_ground(env, index) for index in range(2)])
+    held, free = np.mean(forces[10:], 0)
+    data = env.simulation.data(1)
+    on_its_own = 5 * GRAVITY if data.body("box").xpos[2] < 0.2 else 0.0
+    assert held == pytest.approx(47 * GRAVITY, rel=0.03)
+    assert free - on_its_own == pytest.approx(42 * GRAVITY, rel=0.03)
+    assert env.simulation.state["qpos"][0, -5] > 1.1
+
+
+def over_the_target(env, clearance, shift=0.0):
+    """A state in which the box that is held is above the target."""
+    state = holding(env)
+    state["mocap_pos"][:, 1, 0] += 5
+    place = state["qpos"][:, -7:-4].clone()
+    place[:, 2] -= HALF_SIZE + clearance
+    place[:, 0] += shift
+    state["mocap_pos"][:, 0] = place
+    return state
+
+
+def test_the_joint_opens_once_the_box_stands_on_the_target():
+    env = make()
+    carrier = env.reset(over_the_target(env, 0.005), set_state=True)
+    carrier = play(env, carrier, 1)
+    assert joined(env) == [0.0, 0.0]
+    play(env, carrier, 20)
+    data = env.simulation.data(0)
+    assert data.body("box").xpos[2] - HALF_SIZE == pytest.approx(data.body("target").xpos[2], abs=2e-3)
+    assert np.abs(data.body("box").cvel).max() < 1e-2
+
+
+@pytest.mark.parametrize(("clearance", "shift"), [(0.03, 0.0), (0.005, 0.145)])
+def test_the_joint_stays_closed_above_the_target_and_beside_it(clearance, shift):
+    env = make()
+    play(env, env.reset(over_the_target(env, clearance, shift), set_state=True), 3)
+    assert joined(env) == [1.0, 1.0]
+
+
+def test_a_box_that_was_put_down_is_not_taken_again_in_the_same_episode():
+    env = make()
+    play(env, env.reset(over_the_target(env, 0.005), set_state=True), 2)
+    state = env.get_state()
+    state["mocap_pos"] = state["mocap_pos"].flip(1)  # now the box stands on the source
+    assert (env.simulation.outputs["sensordata"] < 0).all()
+    play(env, env.reset(state, set_state=True), 3)
+    assert joined(env) == [0.0, 0.0]
+    state["taken"][1] = 0
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [0.0, 1.0]
+
+
+def test_a_box_that_does_not_stand_on_the_source_is_not_taken():
+    env = make(3)
+    state = ahead(env, -0.002)
+    state["mocap_pos"][0, 1, 2] -= 0.03
+    state["mocap_pos"][1, 1, 0] += 5
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [0.0, 0.0, 1.0]
+
+
+def test_a_partial_reset_opens_the_joint_of_its_own_simulation_only():
+    env = make(3)
+    state = holding(env)
+    default = torch.from_numpy(env.simulation.model.eq_data)
+    assert not torch.equal(state["eq_data"][1], default)
+    carrier = env.reset(state, set_state=True)
+    env.reset(carrier.set("_reset", torch.tensor([[False], [True], [False]])))
+    after = env.get_state()
+    assert joined(env) == [1.0, 0.0, 1.0]
+    assert torch.equal(after["eq_data"][1], default)
+    assert after["taken"].tolist() == [1.0, 0.0, 1.0]
+    for key, value in after.items():
+        assert torch.equal(value[[0, 2]], state[key][[0, 2]]), key
+
+
+def test_a_restored_hold_continues_bit_for_bit():
+    env, other = make(2, terminate_on_fall=False), make(2, terminate_on_fall=False, seed=5)
+    carrier = env.reset(holding(env), set_state=True)
+    action = torch.rand(2, 17, generator=torch.Generator().manual_seed(0)) * 0.2 - 0.1
+    carrier = play(env, carrier, 4, action)
+    state = env.get_state()
+    play(env, carrier, 10, action)
+    play(other, other.reset(), 2, action)
+    play(other, other.reset(state, set_state=True), 10, action)
+    for key, value in env.get_state().items():
+        assert torch.equal(value, other.get_state()[key]), key
+    assert joined(env) == [1.0, 1.0]
+
+
+def test_a_simulation_is_looked_into_with_its_own_joint():
+    env = make(2)
+    state = holding(env)
+    state["eq_data"][1, 0, 3] += 0.1
+    env.reset(state, set_state=True)
+    strains = []
+    for index in range(2):
+        data = env.simulation.data(index)
+        weld = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        strains.append(np.abs(data.efc_pos[weld]).max())
+    assert strains[0] < 1e-3
+    assert strains[1] == pytest.approx(0.1, abs=2e-3)
+
+
+def test_the_box_waits_on_the_source_as_it_is_turned():
+    env = make(8, object_distances=(3.0, 5.0))
+    carrier = env.reset()
+    state = env.get_state()
+    assert torch.equal(state["qpos"][:, -4:], state["mocap_quat"][:, 1])
+    assert state["mocap_quat"][:, :, 3].std() > 0.2
+    play(env, carrier, 30)
+    after = env.get_state()
+    assert (after["qpos"][:, -7:] - state["qpos"][:, -7:]).abs().max() < 1e-3
+    assert joined(env) == [0.0] * 8
+
+
+def test_no_target_stands_in_the_character_and_none_further_than_asked():
+    env = make(2000, object_distances=(0.0, 1.0), target_distances=(0.0, 1.5))
+    env.reset()
+    target, source = env.simulation.state["mocap_pos"][:, :, :2].unbind(1)
+    corner = math.hypot(HALF_SIZE, HALF_SIZE)
+    arms_length = math.hypot(FRONT, 0.145)  # a corner of the torso
+    assert target.norm(dim=-1).min() >= arms_length + corner - 1e-9
+    distances = (target - source).norm(dim=-1)
+    assert distances.min() >= 2 * corner
+    assert distances.max() <= 1.5
+
+
+def test_a_character_without_a_carrier_is_refused(monkeypatch):
+    monkeypatch.setitem(CHARACTERS, "biped", dataclasses.replace(BIPED, carrier=None))
+    with pytest.raises(ValueError, match="character='biped' has no body to carry a box with: pass one of humanoid"):
+        make()

@@ -1,0 +1,37 @@
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from torchrl_mcp.envs import Heading
+
+NAMES = sorted(name for name in gymnasium.registry if name.startswith("torchrl_mcp/"))
+
+
+def test_every_task_is_registered_with_every_character():
+    tasks, characters = ("Carry", "Dribble", "Heading"), ("Biped", "Humanoid", "Trex")
+    assert NAMES == [f"torchrl_mcp/{task}-{character}-v0" for task in tasks for character in characters]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gymnasium_finds_nothing_wrong(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*Box.*(minimum|maximum) value is (-)?infinity")
+        check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
+
+
+def test_a_single_environment_is_the_batch_of_one():
+    env, batch = gymnasium.make("torchrl_mcp/Heading-Biped-v0", max_turn=0.1), Heading("biped", 1, max_turn=0.1, seed=3)
+    state, (observation, _) = batch.reset(), env.reset(seed=3)
+    for action in np.random.default_rng(0).uniform(-0.3, 0.3, (30, 17)).astype(np.float32):
+        np.testing.assert_array_equal(observation["observation"], state["observation"][0])
+        np.testing.assert_array_equal(observation["goal"], state["goal"][0])
+        observation, reward, terminated, truncated, _ = env.step(action)
+        state = batch.step(state.set("action", torch.tensor(action)[None]))["next"]
+        assert (reward, terminated, truncated) == tuple(
+            state[key].item() for key in ("reward", "terminated", "truncated")
+        )
