@@ -14,6 +14,9 @@ from torchrl.envs import EnvBase
 from torchrl_mcp.envs.rendering import Arrow, Camera
 from torchrl_mcp.envs.simulation import LARGEST, Simulation
 
+ALL = slice(None)
+"""All simulations, as an index that takes no copy."""
+
 
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
@@ -92,6 +95,7 @@ class CharacterEnv(EnvBase):
         self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()}
         self.num_faults = 0
         self._snapshot: TensorDict | None = None
+        self._observed: dict[str, Tensor] = {}
         self.generator = torch.Generator()
         self.set_seed(seed)
         self._dtype, self._pin_memory = dtype, pin_memory
@@ -140,7 +144,8 @@ class CharacterEnv(EnvBase):
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
         low, high = self._action_bounds().to(self._dtype).expand(self.num_envs, -1, -1).unbind(-1)
-        observed = {key: self._spec(value) for key, value in self._observe().items()}
+        self._observed = {key: value.to(self._type(value), copy=True) for key, value in self._observe(ALL).items()}
+        observed = {key: self._spec(value) for key, value in self._observed.items()}
         self.observation_spec = Composite(observed, shape=shape)
         self.action_spec = Bounded(low, high, dtype=self._dtype)
         self.reward_spec = Unbounded(one, dtype=self._dtype)
@@ -174,7 +179,7 @@ class CharacterEnv(EnvBase):
             reward[faults], terminated[faults] = 0.0, True
             self.num_faults += len(faults)
         truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._exhausted()
-        return self._emit(reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
+        return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -191,7 +196,7 @@ class CharacterEnv(EnvBase):
         for key, memory in self.episode.items():
             memory[ids] = state[key].to(memory.dtype)
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool)
-        return self._emit(None, no, no.clone())
+        return self._emit(ids if len(ids) < self.num_envs else ALL, None, no, no.clone())
 
     def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:
         """Rows ``ids`` of the state in ``tensordict``, or an error that says what is wrong with it."""
@@ -209,8 +214,11 @@ class CharacterEnv(EnvBase):
                 raise ValueError(f"{key} is not finite, or beyond MuJoCo's limit of {LARGEST:g}: correct it")
         return {key: value[ids] for key, value in given.items()}
 
-    def _emit(self, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
-        emitted = {key: value.to(self._type(value), copy=True) for key, value in self._observe().items()}
+    def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
+        """What is told of all simulations, of which only ``ids`` have changed since the last time."""
+        for key, value in self._observe(ids).items():
+            self._observed[key][ids] = value.to(self._type(value))
+        emitted = {key: value.clone() for key, value in self._observed.items()}
         emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
         if reward is not None:
             emitted["reward"] = reward
@@ -238,8 +246,15 @@ class CharacterEnv(EnvBase):
         """The parts of ``episode`` that follow from the state at its beginning, rows of the simulations ``ids``."""
 
     @abstractmethod
-    def _observe(self) -> dict[str, Tensor]:
-        """Observation, goal and, for tasks that can succeed, the flag ``success``, each ``(N, ...)``."""
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """What simulations show: ``observation``, ``goal`` and, for the record, flags and numbers of other names.
+
+        Args:
+            ids: Which, as indices ``(n,)`` or the slice of all.
+
+        Returns:
+            Each ``(n, ...)``; live views will do.
+        """
 
     @abstractmethod
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:

@@ -117,5 +117,8 @@ def add_ball(spec: mujoco.MjSpec) -> None:
         contype=1,
         conaffinity=1,
         friction=[FRICTION, 0, 0],
-        priority=1,  # its friction counts, not the greater of the two
+        priority=1,  # its friction and softness count, not the greater friction and the mean softness of the two
+        # Softer than MuJoCo's own (0.02 s, 0.9), with which a ball that slides at 4 m/s hops by 40 mm instead of 7.
+        solref=[0.05, 1],
+        solimp=[0.97, 0.97, 0.001, 0.5, 2],
     )

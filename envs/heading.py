@@ -78,9 +78,9 @@ class Heading(PDCharacterEnv):
             "direction": direction.uniform_(*self.initial_directions, generator=self.generator),
         }
 
-    def _observe(self) -> dict[str, Tensor]:
-        angle = self.heading()
-        return {"observation": self._state(angle), "goal": unit_vector(self.episode["direction"] - angle)}
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        angle = self.heading(ids)
+        return {"observation": self._state(ids, angle), "goal": unit_vector(self.episode["direction"][ids] - angle)}
 
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         direction = self.episode["direction"]

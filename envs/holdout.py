@@ -151,11 +151,11 @@ class Holdout(CharacterEnv):
             begun["contact_forces"] = torch.zeros_like(self.episode["contact_forces"][ids])
         return begun
 
-    def _observe(self) -> dict[str, Tensor]:
-        parts = [self._posture, self._qvel]
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        parts = [self._posture[ids], self._qvel[ids]]
         if "contact_forces" in self.episode:
-            parts.append(self.episode["contact_forces"][:, 1:].flatten(1))  # Ant-v5 leaves the world body out
-        return {"observation": torch.cat(parts, -1), "goal": self.episode["goal"]}
+            parts.append(self.episode["contact_forces"][ids, 1:].flatten(1))  # Ant-v5 leaves the world body out
+        return {"observation": torch.cat(parts, -1), "goal": self.episode["goal"][ids]}
 
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         velocity = (self._torso - self.episode["position"]) / self.control_timestep

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.joints import joint_layout
 from torchrl_mcp.envs.motions.kinematics import BodyStates
@@ -95,11 +96,10 @@ class Imitation(PDCharacterEnv):
         r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`R / (T \sum_i w_i)`."""
         return episode_return / (self.max_episode_steps * sum(term.weight for term in self.terms.values()))
 
-    def _reference(self, steps: int) -> MotionState:
-        """The reference as many steps ahead, in the world."""
-        episode = self.episode
-        moment = self.library.at(episode["clip"], episode["time"] + steps * CONTROL_TIMESTEP)
-        return moment.placed(Placement(episode["turn"], episode["shift"]))
+    def _reference(self, steps: int, ids: Tensor | slice = ALL) -> MotionState:
+        """The references of simulations as many steps ahead, in the world."""
+        clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
+        return self.library.at(clip, time + steps * CONTROL_TIMESTEP).placed(Placement(turn, shift))
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         clips, times = self.library.sample(num, self.generator)
@@ -116,14 +116,14 @@ class Imitation(PDCharacterEnv):
             "error": torch.zeros(num, dtype=torch.float64),
         }
 
-    def _observe(self) -> dict[str, Tensor]:
-        angle, origin = self.heading(), self._positions[:, 0] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-        targets = [self._reference(step).bodies for step in range(1, NUM_TARGETS + 1)]
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        angle, origin = self.heading(ids), self._positions[ids, 0] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        targets = [self._reference(step, ids).bodies for step in range(1, NUM_TARGETS + 1)]
         goal = [bodies_in_heading_frame(angle, origin, target) for target in targets]
         return {
-            "observation": self._state(angle),
+            "observation": self._state(ids, angle),
             "goal": torch.cat(goal, -1),
-            "tracking_error": self.episode["error"].unsqueeze(-1),
+            "tracking_error": self.episode["error"][ids].unsqueeze(-1),
         }
 
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:

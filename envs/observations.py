@@ -44,13 +44,10 @@ def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -
     Returns:
         Shape ``(*B, 13 L)``.
     """
-    parts = [
-        into_heading_frame(angle, bodies.positions - origin.unsqueeze(-2)),
-        orientations_in_heading_frame(angle, bodies.orientations),
-        into_heading_frame(angle, bodies.linear_velocities),
-        into_heading_frame(angle, bodies.angular_velocities),
-    ]
-    return torch.cat(parts, -1).flatten(-2)
+    vectors = [bodies.positions - origin.unsqueeze(-2), bodies.linear_velocities, bodies.angular_velocities]
+    relative, linear, angular = into_heading_frame(angle, torch.cat(vectors, -2)).chunk(3, -2)
+    orientations = orientations_in_heading_frame(angle, bodies.orientations)
+    return torch.cat([relative, orientations, linear, angular], -1).flatten(-2)
 
 
 def character_state(angle: Tensor, bodies: BodyStates) -> Tensor:

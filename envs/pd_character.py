@@ -8,7 +8,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.base import CharacterEnv
+from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import character_state, state_layout
@@ -94,9 +94,9 @@ class PDCharacterEnv(CharacterEnv):
         self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
         self._twists, self._com = outputs["cvel"][:, bodies], outputs["subtree_com"][:, 1]
 
-    def heading(self) -> Tensor:
-        """Direction that each character faces, in radians from the world's x axis, shape ``(N,)``, float64."""
-        return heading(self._orientations[:, 0])
+    def heading(self, ids: Tensor | slice = ALL) -> Tensor:
+        """Direction that characters face, in radians from the world's x axis, shape ``(n,)``, float64."""
+        return heading(self._orientations[ids, 0])
 
     def fallen(self) -> Tensor:
         """Whether a body other than the feet touches the ground, shape ``(N,)``, bool."""
@@ -116,17 +116,17 @@ class PDCharacterEnv(CharacterEnv):
         fallen = self.fallen()
         return reward.masked_fill(fallen, 0.0), fallen & self.terminate_on_fall
 
-    def _body_states(self) -> BodyStates:
-        """The character's bodies in the world, as observed: in ``dtype``."""
-        angular, linear = self._twists.split(3, -1)
+    def _body_states(self, ids: Tensor | slice) -> BodyStates:
+        """The bodies of characters in the world, as observed: in ``dtype``."""
+        positions, (angular, linear) = self._positions[ids], self._twists[ids].split(3, -1)
         # MuJoCo gives the velocity of the point of each body that passes the character's centre of mass.
-        linear = linear + torch.linalg.cross(angular, self._positions - self._com.unsqueeze(1))
-        parts = (self._positions, self._orientations, linear, angular)
+        linear = linear + torch.linalg.cross(angular, positions - self._com[ids].unsqueeze(1))
+        parts = (positions, self._orientations[ids], linear, angular)
         return BodyStates(*(part.to(self._dtype) for part in parts))
 
-    def _state(self, angle: Tensor) -> Tensor:
-        """State s of each character, whose root has the heading ``angle``, ``(N, S)``."""
-        return character_state(angle.to(self._dtype), self._body_states())
+    def _state(self, ids: Tensor | slice, angle: Tensor) -> Tensor:
+        """State s of characters, whose roots have the heading ``angle``, ``(n, S)``."""
+        return character_state(angle.to(self._dtype), self._body_states(ids))
 
     def _action_bounds(self) -> Tensor:
         return torch.tensor([-1.0, 1.0]).expand(len(self._scale), 2)

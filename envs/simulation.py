@@ -32,8 +32,8 @@ class Simulation:
         num_envs: Number N of simulations.
         substeps: Physics steps per call of :meth:`step`.
         num_threads: Threads; 0 takes one per processor. Results do not depend on it.
-        outputs: The other ``MjData`` fields to expose, beside the sensors. After :meth:`step` they are one substep behind
-            the state, as after ``mj_step``; after :meth:`reset` they are current.
+        outputs: The other ``MjData`` fields to expose, beside the sensors. After :meth:`step` they are one substep
+            behind the state, as after ``mj_step``; after :meth:`reset` they are current.
         model_fields: The ``MjModel`` fields of which every simulation has its own. They count as state.
         persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
         current: Bring outputs that follow from positions and velocities up to the state after every step. Free of
@@ -55,7 +55,9 @@ class Simulation:
         self.model = copy.copy(model)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.substeps = substeps
-        self._stage = mujoco.mjtStage.mjSTAGE_VEL if current else mujoco.mjtStage.mjSTAGE_NONE
+        stages = mujoco.mjtStage
+        self._after_step = stages.mjSTAGE_VEL if current else stages.mjSTAGE_NONE
+        self._after_reset = stages.mjSTAGE_VEL if current else stages.mjSTAGE_ACC
         self.physics_seconds = 0.0
         """Wall-clock seconds spent inside MuJoCo so far."""
         self._batch = Batch(self.model, num_envs, num_threads, persistent)
@@ -84,14 +86,14 @@ class Simulation:
         controls = ctrl.detach().numpy()
         np.copyto(self._before, self._rows)
         np.copyto(self._fields["ctrl"], controls)
-        failed = self._run(self._batch.step, nstep=self.substeps, stage=self._stage)
+        failed = self._run(self._batch.step, nstep=self.substeps, stage=self._after_step)
         if not len(failed) and _bounded(controls) and _bounded(self._rows):
             return torch.from_numpy(_NOBODY)
         faults = ~(_bounded(controls, -1) & _bounded(self._rows, -1))
         faults[failed] = True
         ids = faults.nonzero()[0]
         self._rows[ids] = self._before[ids]
-        self._run(self._batch.forward, ids)  # outputs that cannot be computed stay as they are
+        self._run(self._batch.forward, ids, stage=self._after_reset)  # outputs that cannot be computed stay as they are
         self._rows[ids] = self._before[ids]
         return torch.from_numpy(ids)
 
@@ -108,7 +110,7 @@ class Simulation:
             self._fields[name][rows] = getattr(self.model, name)
         for name, value in fields.items():
             self._fields[name][rows] = value.numpy()
-        if len(failed := self._run(self._batch.forward, rows)):
+        if len(failed := self._run(self._batch.forward, rows, stage=self._after_reset)):
             raise ValueError(f"MuJoCo cannot compute the state given to simulation {failed[0]}: correct it")
         if "qacc_warmstart" in fields:  # mj_forward replaced it
             self._fields["qacc_warmstart"][rows] = fields["qacc_warmstart"].numpy()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Term(NamedTuple):
-    """A term of the imitation reward, :math:`w \\exp(-c \\, e)` of an error :math:`e`."""
+    r"""A term of the imitation reward, :math:`w \exp(-c \, e)` of an error :math:`e`."""
 
     weight: float
     scale: float

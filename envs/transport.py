@@ -24,8 +24,8 @@ class Transport(PDCharacterEnv):
     """A character moves an object to a target; distances and directions are drawn uniformly for each episode.
 
     ``goal`` shows the things of the scene in the character's heading frame, positions relative to the root;
-    ``goal_layout`` names its entries. ``success`` (1, bool) says whether the object is at the target: within 0.5 m on
-    the ground plan, now, and not once and for all.
+    ``goal_layout`` names its entries. ``success`` (1, bool) says whether the object is now at the target, that is,
+    horizontally within 0.5 m.
 
     The reward is by default as printed in the paper. Two variants of the same authors' public code may be switched on:
     the plain distance to the target, which unlike its square still says something at 10 m, and every term 1 while
@@ -75,8 +75,8 @@ class Transport(PDCharacterEnv):
         not_negative(speed=speed)
         if target_distance_power not in (1, 2):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
-        self.object_distances = distances("object_distances", object_distances)
-        self.target_distances = distances("target_distances", target_distances)
+        self.object_distances = distance_range("object_distances", object_distances)
+        self.target_distances = distance_range("target_distances", target_distances)
         self.success_reward = success_reward
         self.goal_layout = goal_layout(things)
         """Where to find each quantity in ``goal``, by name."""
@@ -129,22 +129,22 @@ class Transport(PDCharacterEnv):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "object": self._object[ids]}
 
-    def _observe(self) -> dict[str, Tensor]:
-        bodies = self._body_states()
-        root, angle = bodies.positions[:, 0], self.heading().to(self._dtype)
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        bodies = self._body_states(ids)
+        root, angle = bodies.positions[:, 0], self.heading(ids).to(self._dtype)
         seen = bodies_in_heading_frame(angle, root, bodies).unflatten(-1, (-1, 13))
         own, things = seen.split([len(self._bodies), len(self._shown)], 1)
         shown = [things[:, index, :size] for index, size in enumerate(self._shown.values())]
         return {
             "observation": torch.cat([root[:, 2:], own.flatten(1)], -1),
             "goal": torch.cat(shown, -1),
-            "success": self.success().unsqueeze(-1),
+            "success": self.success()[ids].unsqueeze(-1),
         }
 
-    def _body_states(self) -> BodyStates:
+    def _body_states(self, ids: Tensor | slice) -> BodyStates:
         """The character's bodies and the things: seen together, they take little longer than the character alone."""
-        things = (part.to(self._dtype) for part in self._things)
-        return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(), things, strict=True)))
+        things = (part[ids].to(self._dtype) for part in self._things)
+        return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(ids), things, strict=True)))
 
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
@@ -181,7 +181,7 @@ def goal_layout(things: Mapping[str, int]) -> dict[str, slice]:
     return layout
 
 
-def distances(name: str, value: Sequence[float]) -> tuple[float, float]:
+def distance_range(name: str, value: Sequence[float]) -> tuple[float, float]:
     """Check that ``value`` is a range of distances, and return it."""
     low, high = interval(name, value)
     if low < 0:
@@ -203,7 +203,7 @@ def mocap_positions(model: mujoco.MjModel) -> Tensor:
 
 
 def reach(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
-    """How far a character's rest pose extends from its root on the ground plan.
+    """How far a character's rest pose extends horizontally from its root.
 
     Args:
         model: The scene, whose first bodies are the character's.

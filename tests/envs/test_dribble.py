@@ -52,7 +52,12 @@ def test_a_rolling_ball_loses_two_fifths_of_its_speed_per_second():
 
 def test_a_ball_that_slides_is_braked_by_its_own_friction_until_it_rolls():
     env = make()
-    velocities = play(env, thrown(env, velocity=(0.0, 4.0, 0.0)), 20)
+    carrier = thrown(env, velocity=(0.0, 4.0, 0.0))
+    velocities, heights = [], []
+    for _ in range(20):
+        velocities.append(play(env, carrier, 1)[0])
+        heights.append(env.simulation.state["qpos"][0, -5].item())
+    velocities = np.array(velocities)
     speed, surface, time_step = 4.0, 0.0, 1e-4  # m dv/dt = -mu m g - m k v, 2/5 m r dw/dt = mu m g - 2/5 m r k w
     expected = []
     for step in range(1, 20 * 334):
@@ -61,8 +66,9 @@ def test_a_ball_that_slides_is_braked_by_its_own_friction_until_it_rolls():
         surface += time_step * (2.5 * sliding - RATE * surface)
         if step in {round(k / 30 / time_step) for k in range(1, 21)}:
             expected.append(speed)
-    np.testing.assert_allclose(velocities[:, 1], expected, rtol=0.015)
-    assert velocities[-1, 1] < 5 / 7 * 4  # what is left without damping
+    np.testing.assert_allclose(velocities[:, 1], expected, atol=0.03 * 4)
+    np.testing.assert_allclose(velocities[-8:, 1], expected[-8:], rtol=0.005)  # it rolls
+    assert max(heights) < RADIUS + 0.01
 
 
 def test_in_the_air_ball_and_spin_are_damped_alike():
@@ -106,12 +112,12 @@ def test_a_foot_sends_the_ball_away():
     env = make()
     env.reset()
     state = env.get_state()
-    state["qpos"][:, -7:-4] = torch.tensor([0.45, 0.085, RADIUS])
-    state["qvel"][:, 0] = 2.0  # the whole character moves forward
-    carrier = env.reset(state, set_state=True)
-    velocities = play(env, carrier, 8)
+    state["qpos"][:, 2] += 0.05
+    state["qpos"][:, -7:-4] = torch.tensor([0.36, 0.085, RADIUS])
+    state["qvel"][:, 0] = 2.0  # the whole character flies forward
+    velocities = play(env, env.reset(state, set_state=True), 6)
     assert velocities[-1, 0] > 1.0
-    assert velocities[-1, 0] > env.simulation.state["qvel"][0, 0].item()
+    assert env.simulation.state["qvel"][0, 0] < 2.0
 
 
 def test_the_target_is_no_obstacle():

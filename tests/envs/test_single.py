@@ -13,7 +13,7 @@ NAMES = sorted(name for name in gymnasium.registry if name.startswith("torchrl_m
 
 def test_every_task_is_registered_with_every_character():
     tasks, characters = ("Carry", "Dribble", "Heading"), ("Biped", "Humanoid", "Trex")
-    assert NAMES == [f"torchrl_mcp/{task}-{character}-v0" for task in tasks for character in characters]
+    assert [f"torchrl_mcp/{task}-{character}-v0" for task in tasks for character in characters] == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)

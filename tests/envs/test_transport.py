@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_mcp.envs import Carry, Dribble
@@ -301,12 +300,3 @@ def test_pictures_show_the_target_and_the_arrows_to_it(task):
     env.close()
     assert red[0].max() > 230  # the camera looks along y at the character: x points right
     assert red[1].min() < 90
-
-
-def test_a_state_without_the_target_is_told_so():
-    env = make(Dribble)
-    env.reset()
-    state = env.get_state()
-    state["mocap_pos"] = torch.zeros(4, 2, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"mocap_pos has shape \(4, 2, 3\): pass \(4, 1, 3\)"):
-        env.reset(TensorDict(state, [4]), set_state=True)

@@ -1,0 +1,261 @@
+"""Walks of the Tyrannosaurus: keyframes of a stride, splines between them, and inverse kinematics of the legs.
+
+Phases of a stride go from 0 to 1; the right foot touches down at 0, the left foot half a stride later.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.joints import character_model, joint_layout
+from torchrl_mcp.envs.motions.keyframes import Keyframes, halting, minimum_jerk, smooth
+from torchrl_mcp.envs.motions.placement import Placement
+from torchrl_mcp.envs.rotations import about_x, about_y, about_z, from_rotation_vector, inverse, multiply, rotate
+
+FPS = 60.0
+GRAVITY = 9.81
+
+# Alexander (1976): animals of hip height h that walk at Fr = v^2 / (g h) make strides of 2.3 h Fr^0.3. For this body
+# that is 1.10 m at 1 m/s, the speed of the transfer tasks. (The slow walk in time with the natural frequency of an
+# adult's tail, of van Bijlert et al., 2021, scales to 0.7 m/s and strides of 1.7 s.)
+STRIDE_TIME = 1.1
+"""Seconds."""
+
+STRIDES = 2
+"""In a clip of 2.2 s. Five of them make the paper's 11 s."""
+
+STRAIGHT = (1.0, 0.0)
+LEFT_TURNS = ((0.9, 0.5), (0.8, 1.0))
+"""Speeds in m/s and turn rates in rad/s. Whoever turns slows down."""
+
+HEIGHT = 0.9
+"""Of the hips, in m: 3 cm lower than at rest, so that the legs reach from step to step."""
+
+# Metres about the path and the height, and between and ahead of the feet, chosen such that pushes of the ground against
+# the feet make the body move like this: its weight goes from foot to foot as it sways, falls back and catches up.
+SWAY: Keyframes = ((0.06, 0.0), (0.31, -0.018), (0.56, 0.0), (0.81, 0.018))
+SURGE: Keyframes = ((0.185, 0.01), (0.435, -0.01), (0.685, 0.01), (0.935, -0.01))
+BOB: Keyframes = ((0.055, -0.012), (0.305, 0.012), (0.555, -0.012), (0.805, 0.012))
+STEP_WIDTH = 0.12
+TOE_AHEAD = 0.19
+"""Of the hips, in m: where the tip of a foot is in the middle of its stance."""
+
+# In rad. The right hip is ahead when the right foot touches down, and the pelvis drops on the side of the swing.
+PELVIS_YAW: Keyframes = ((0.0, 0.06), (0.25, 0.0), (0.5, -0.06), (0.75, 0.0))
+PELVIS_ROLL: Keyframes = ((0.2, -0.03), (0.45, 0.0), (0.7, 0.03), (0.95, 0.0))
+LEAN = 0.53
+"""Of the pelvis in a turn, relative to the lean that balances it: that of walking humans."""
+
+TAIL_YAW: Keyframes = ((0.0, -1.0), (0.25, 0.0), (0.5, 1.0), (0.75, 0.0))
+TAIL_SWING = (0.09, 0.04, 0.04, 0.04, 0.04)
+"""Amplitude of each joint in rad. The first outweighs the yaw of the pelvis, so that the tail swings against it."""
+
+TAIL_LAG = 0.04
+"""Strides by which each joint of the tail is behind the last."""
+
+TAIL_BEND, CHEST_BEND, NECK_BEND = 0.12, 0.1, 0.075
+"""Into a turn, in rad per rad/s, at each joint."""
+
+DUTY = 0.62
+"""Fraction of a stride in which a foot is on the ground."""
+
+SWING = (DUTY + 0.02, 0.98)
+"""Phases between which a foot moves forward: once it has left the ground, and until just before it is back."""
+
+FOOT_LIFT: Keyframes = ((0.0, 0.0), (DUTY, 0.0), (0.78, 0.1))
+FOOT_ASIDE: Keyframes = ((0.0, 0.0), (DUTY, 0.0), (0.78, 0.05))
+"""Metres up, and outwards, around the other leg."""
+
+FOOT_PITCH: Keyframes = ((0.0, 0.0), (0.44, 0.0), (0.7, -0.9), (0.98, 0.0))
+"""Of the toes upwards, in rad: the foot rolls over its tip before it leaves the ground."""
+
+METATARSUS: Keyframes = ((0.0, 0.3), (0.3, 0.15), (0.58, -0.2), (0.8, 0.75))
+"""Angle by which it leans back from the line between hip and toes, in rad."""
+
+
+class Step(NamedTuple):
+    """The motion of a foot.
+
+    Attributes:
+        position: Of its joint, the root of the toes, shape ``(T, 3)``.
+        orientation: Shape ``(T, 4)``.
+        yaw: Direction in which it points, shape ``(T,)``.
+        phase: Of its own stride, which begins when it touches down, shape ``(T,)``.
+    """
+
+    position: Tensor
+    orientation: Tensor
+    yaw: Tensor
+    phase: Tensor
+
+
+def trex_corpus() -> list[MotionClip]:
+    """Walking straight, turning left at two rates, and turning right as the mirror images of that: 11 s of loops.
+
+    Example:
+        >>> [round(float(clip.cycle.turn), 1) for clip in trex_corpus()]
+        [0.0, 1.1, 2.2, -1.1, -2.2]
+    """
+    left = [trex_walk(speed, turn_rate) for speed, turn_rate in LEFT_TURNS]
+    return [trex_walk(*STRAIGHT), *left, *(clip.mirrored() for clip in left)]
+
+
+def trex_walk(speed: float, turn_rate: float) -> MotionClip:
+    """Walk along an arc of a circle, or straight, in a loop that begins at the origin.
+
+    Args:
+        speed: Of the hips, in m/s.
+        turn_rate: To the left, in rad/s.
+
+    Raises:
+        ValueError: If it would walk backwards, the legs do not reach from step to step, or the loop turns half around.
+
+    Reference:
+        Alexander, Estimates of speeds of dinosaurs, 1976, https://doi.org/10.1038/261129a0.
+        van Bijlert et al., Natural frequency method: estimating the preferred walking speed of Tyrannosaurus rex based
+        on tail natural frequency, 2021, https://doi.org/10.1098/rsos.201441.
+    """
+    duration = STRIDES * STRIDE_TIME
+    if not speed >= 0:
+        raise ValueError(f"speed={speed} is backwards, or nothing at all: pass 0 or more m/s")
+    if not abs(turn_rate) * duration < torch.pi:
+        raise ValueError(f"turn_rate={turn_rate} turns a loop half around: pass less than {torch.pi / duration:.2f}")
+    time = torch.arange(round(duration * FPS) + 1, dtype=torch.float64) / FPS
+    phase, path = time / STRIDE_TIME, _path(time, speed, turn_rate)
+    place, pelvis = _pelvis(phase, speed * turn_rate / GRAVITY)
+    position, orientation = path.points(place), path.quaternions(pelvis)
+    still = about_z(torch.zeros_like(phase))
+    joints = {
+        **_front(phase, place, pelvis, turn_rate),
+        **{"right_shoulder": still, "left_shoulder": still},
+        **_tail(phase, turn_rate),
+        **_leg("right", position, orientation, path.turn, _step("right", phase, speed, turn_rate)),
+        **_leg("left", position, orientation, path.turn, _step("left", phase, speed, turn_rate)),
+    }
+    if not all(joint.isfinite().all() for joint in joints.values()):
+        raise ValueError(f"speed={speed}, turn_rate={turn_rate} asks for longer steps than the legs allow: pass less")
+    moving = [joints[name] for name in joint_layout("trex").names[1:]]
+    return MotionClip("trex", torch.cat([position, orientation, *moving], dim=-1), FPS, loop=True)
+
+
+def _path(time: Tensor, speed: float, turn_rate: float) -> Placement:
+    """Arc from the origin along x: its chord is v t sinc(w t / 2) long, in the direction w t / 2."""
+    turn = turn_rate * time
+    chord = speed * time * torch.sinc(turn / 2 / torch.pi)
+    return Placement(turn, chord.unsqueeze(-1) * torch.stack([(turn / 2).cos(), (turn / 2).sin()], dim=-1))
+
+
+def _pelvis(phase: Tensor, lean: float) -> tuple[Tensor, Tensor]:
+    """Position ``(T, 3)`` and orientation ``(T, 4)`` of the pelvis relative to the path; ``lean`` is to the left."""
+    place = torch.stack([smooth(SURGE, phase), smooth(SWAY, phase), HEIGHT + smooth(BOB, phase)], dim=-1)
+    return place, multiply(about_z(smooth(PELVIS_YAW, phase)), about_x(smooth(PELVIS_ROLL, phase) - LEAN * lean))
+
+
+def _front(phase: Tensor, place: Tensor, pelvis: Tensor, turn_rate: float) -> dict[str, Tensor]:
+    """Chest, neck and head: the chest is a beam that turns such that the head at its end keeps its height and line."""
+    beam_turn, neck = (about_z(torch.full_like(phase, bend * turn_rate)) for bend in (CHEST_BEND, NECK_BEND))
+    offset = {name: _offset(name).expand(len(phase), 3) for name in ("chest", "lower_neck", "upper_neck", "head")}
+    neck_to_head = offset["upper_neck"] + rotate(neck, offset["head"])
+    beam = rotate(beam_turn, offset["lower_neck"] + rotate(neck, neck_to_head))
+    rest = torch.tensor([0.0, 0.0, HEIGHT], dtype=torch.float64)
+    _, y, z = (rest + offset["chest"] + beam - place - rotate(pelvis, offset["chest"])).unbind(-1)
+    length = torch.linalg.vector_norm(beam, dim=-1)
+    wanted = torch.stack([(length**2 - y**2 - z**2).sqrt(), y, z], dim=-1)
+    # The cross product is the rotation vector but for terms of third order in its small angle.
+    steadying = from_rotation_vector(torch.linalg.cross(beam, wanted) / length.unsqueeze(-1) ** 2)
+    chest = multiply(steadying, beam_turn)
+    bent = about_z(torch.full_like(phase, (CHEST_BEND + 2 * NECK_BEND) * turn_rate))
+    head = multiply(inverse(multiply(chest, multiply(neck, neck))), bent)
+    return {"chest": multiply(inverse(pelvis), chest), "lower_neck": neck, "upper_neck": neck, "head": head}
+
+
+def _tail(phase: Tensor, turn_rate: float) -> dict[str, Tensor]:
+    """A wave that runs down the tail."""
+    yaws = [swing * smooth(TAIL_YAW, phase - TAIL_LAG * joint) for joint, swing in enumerate(TAIL_SWING)]
+    return {f"tail_{joint}": about_z(yaw - TAIL_BEND * turn_rate) for joint, yaw in enumerate(yaws, start=1)}
+
+
+def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
+    """Plant a foot beside the path for its stance, let it roll over its tip, and carry it to its next place.
+
+    The tip is a sphere, which rolls on without sliding: it advances by its radius times the angle.
+    """
+    start = 0.0 if side == "right" else 0.5
+    own = phase - start
+    count, own = own.floor(), own % 1
+    progress = minimum_jerk((own - SWING[0]) / (SWING[1] - SWING[0]))
+    ground = _plant(side, start + count + progress, speed, turn_rate)
+    pitch, lift, aside = (halting(keyframes, own) for keyframes in (FOOT_PITCH, FOOT_LIFT, FOOT_ASIDE))
+    orientation = ground.quaternions(about_y(-pitch))
+    tip, radius = _tip(side)
+    moved = torch.stack([-radius * pitch, aside if side == "left" else -aside, radius + lift], dim=-1)
+    position = ground.points(moved) - rotate(orientation, tip.expand(len(phase), 3))
+    return Step(position, orientation, ground.turn, own)
+
+
+def _plant(side: str, touchdown: Tensor, speed: float, turn_rate: float) -> Placement:
+    """Ground under the tip of a foot that touches down at a phase, and the direction of the foot.
+
+    In a turn the feet are set outside the path of the hips, so that the body balances leaning inwards.
+    """
+    path = _path((touchdown + DUTY / 2) * STRIDE_TIME, speed, turn_rate)
+    aside = (STEP_WIDTH / 2 if side == "left" else -STEP_WIDTH / 2) - HEIGHT * speed * turn_rate / GRAVITY
+    beside = torch.tensor([TOE_AHEAD, aside], dtype=torch.float64).expand(len(touchdown), 2)
+    return path.after(Placement(torch.zeros_like(touchdown), beside))
+
+
+def _leg(side: str, position: Tensor, orientation: Tensor, heading: Tensor, step: Step) -> dict[str, Tensor]:
+    r"""Inverse kinematics from pelvis to foot, in the plane through hip and toes that turns half-way with the foot.
+
+    Angles in that plane are from straight down, forwards. The metatarsus follows its keyframes. Thigh :math:`a` and
+    shank :math:`b` then make a triangle with the line :math:`r` from hip to ankle, knee in front:
+
+    .. math:: \cos(\alpha_{hip} - \alpha_r) = \frac{a^2 + r^2 - b^2}{2 a r}
+
+    Args:
+        side: ``"right"`` or ``"left"``.
+        position: Of the pelvis, shape ``(T, 3)``.
+        orientation: Of the pelvis, shape ``(T, 4)``.
+        heading: Direction of the path, shape ``(T,)``.
+        step: Of the foot.
+    """
+    hip = position + rotate(orientation, _offset(f"{side}_hip").expand_as(position))
+    yaw = (heading + step.yaw) / 2
+    x, y, z = rotate(about_z(-yaw), step.position - hip).unbind(-1)
+    plane = multiply(about_z(yaw), about_x(torch.atan2(y, -z)))
+    down = torch.hypot(y, z)
+    (thigh, thigh_rest), (shank, shank_rest), (metatarsus, metatarsus_rest) = (
+        _bone(f"{side}_{end}") for end in ("knee", "ankle", "toe")
+    )
+    foot_angle = torch.atan2(x, down) + smooth(METATARSUS, step.phase)
+    x, down = x - metatarsus * foot_angle.sin(), down - metatarsus * foot_angle.cos()
+    reach = torch.hypot(x, down)
+    hip_angle = torch.atan2(x, down) + torch.acos((thigh**2 + reach**2 - shank**2) / (2 * thigh * reach))
+    knee_angle = torch.atan2(x - thigh * hip_angle.sin(), down - thigh * hip_angle.cos())
+    turns = [hip_angle - thigh_rest, knee_angle - shank_rest, foot_angle - metatarsus_rest]
+    return {
+        f"{side}_hip": multiply(inverse(orientation), multiply(plane, about_y(-turns[0]))),
+        f"{side}_knee": (turns[1] - turns[0]).unsqueeze(-1),
+        f"{side}_ankle": (turns[2] - turns[1]).unsqueeze(-1),
+        f"{side}_toe": multiply(inverse(multiply(plane, about_y(-turns[2]))), step.orientation),
+    }
+
+
+def _offset(body: str) -> Tensor:
+    """Where a body hangs on its parent, shape ``(3,)``."""
+    return torch.tensor(character_model("trex").body(body).pos)
+
+
+def _bone(end: str) -> tuple[float, float]:
+    """Length of the bone that ends at a body, and its angle from straight down in the rest pose."""
+    x, _, z = _offset(end)
+    return float(torch.hypot(x, z)), float(torch.atan2(x, -z))
+
+
+def _tip(side: str) -> tuple[Tensor, float]:
+    """Centre of the sphere at the end of the middle toe, shape ``(3,)``, and its radius."""
+    toe = character_model("trex").geom(f"{side}_toe")
+    radius, half_length, _ = toe.size
+    return torch.tensor(toe.pos) + torch.tensor([half_length, 0.0, 0.0], dtype=torch.float64), float(radius)
