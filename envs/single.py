@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -30,7 +30,7 @@ class SingleEnv(gymnasium.Env):
         {'observation': (105,), 'goal': (2,)}
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 30}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(self, task: type[CharacterEnv], *, render_mode: str | None = None, **kwargs: Any) -> None:
         self.env = task(num_envs=1, num_threads=1, **kwargs)

@@ -61,7 +61,9 @@ def evaluate(
     returns = torch.zeros(env.batch_size)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     terminated = torch.zeros_like(running)
-    positions, flags, sums = [], {}, {}
+    positions: list[Tensor] = []
+    flags: dict[str, Tensor] = {}
+    sums: dict[str, Tensor] = {}
     for key in measured(env):
         measures = flags if env.observation_spec[key].dtype is torch.bool else sums
         measures[key] = torch.zeros(env.batch_size, dtype=env.observation_spec[key].dtype)

@@ -6,6 +6,6 @@ HUMANOID = Character(
     name="humanoid",
     feet=("right_ankle", "left_ankle"),
     key_bodies=("neck", "right_wrist", "left_wrist", "right_ankle", "left_ankle"),
-    carrier="right_wrist",
+    carrier="chest",
 )
 """34 degrees of freedom, 28 controls, 45 kg, 1.62 m (Table 3)."""

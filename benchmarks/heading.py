@@ -1,0 +1,117 @@
+"""The heading task learned from scratch: learning curves, returns beside the paper's, and films.
+
+    python benchmarks/heading.py                      # trains what is missing: an hour or two per character on a core
+    python benchmarks/heading.py --report             # trains nothing
+
+Every character learns with ``method=scratch task=heading preset=fast`` for as many steps as ``CHARACTERS`` says. Run
+folders are in ``--output``; a run that was stopped goes on. The report plays one episode of 20 s in each of
+``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
+film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
+"""
+
+import argparse
+import csv
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp import experiment
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis.figures import save_figure
+
+RESULTS = Path(__file__).resolve().parent / "results"
+CHARACTERS = {"biped": 4_000_000, "humanoid": 3_000_000, "trex": 1_000_000}
+PAPER = {"biped": "0.927 +- 0.032", "humanoid": "0.965 +- 0.010", "trex": "0.840 +- 0.003"}
+COMMON = ["method=scratch", "task=heading", "preset=fast", "logger=none", "torch_threads=1", "num_threads=1"]
+EVALUATION_SEED = 12345
+
+
+def main() -> None:
+    """Train what is missing, evaluate, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--output", type=Path, default=Path("runs/heading"), help="folder of the run folders")
+    parser.add_argument("--characters", nargs="+", default=list(CHARACTERS), choices=CHARACTERS)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
+    parser.add_argument("--report", action="store_true", help="train nothing: report the runs that have ended")
+    parser.add_argument("--episodes", type=int, default=128, help="of each evaluation")
+    arguments = parser.parse_args()
+    runs = {character: arguments.output / f"heading-{character}" for character in arguments.characters}
+    if not arguments.report:
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            list(pool.map(train, runs.values(), runs))
+    report({name: run for name, run in runs.items() if has_ended(run, CHARACTERS[name])}, arguments.episodes)
+
+
+def train(run: Path, character: str) -> None:
+    """Train a character in a process of its own, or go on where a former one stopped."""
+    settings = [f"character={character}", f"training.total_frames={CHARACTERS[character]}", "progress_bar=false"]
+    begun = (run / experiment.CONFIG).exists()
+    arguments = [f"resume={run}"] if begun else [*COMMON, *settings, f"run_dir={run}"]
+    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def has_ended(run: Path, steps: int) -> bool:
+    """Tell whether a run has taken all its steps."""
+    rows = read_metrics(run)
+    return bool(rows) and rows[-1]["frames"] >= steps
+
+
+def report(runs: dict[str, Path], episodes: int) -> None:
+    """Write table, curves and films of runs that have ended to ``benchmarks/results``."""
+    rows = [row for character, run in runs.items() for row in evaluate(character, run, episodes)]
+    with (RESULTS / "heading.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    curves = learning_curves({character: [run] for character, run in runs.items()})
+    write_curves(curves, RESULTS / "heading_curves.csv")
+    save_figure(draw_curves(curves), RESULTS / "heading_curves")
+    for character, run in runs.items():
+        first, *others = film(run)
+        path = RESULTS / f"heading_{character}.gif"
+        first.save(path, save_all=True, append_images=others, duration=1000 / 15, loop=0)
+    for row in rows:
+        print(
+            f"{row['character']} {row['mode']}: {row['normalised_return']:.3f} +- {row['normalised_return_std']:.3f}, "
+            f"fallen {row['terminated']:.0%}, paper {row['paper']}"
+        )
+
+
+def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
+    """Yield the numbers of a run, deterministic and stochastic."""
+    last = read_metrics(run)[-1]
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    facts = {"character": character, "method": "scratch", "seed": 0, "preset": "fast", "paper": PAPER[character]}
+    cost = {"frames": int(last["frames"]), "training_seconds": round(last["seconds"])}
+    machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
+    for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
+        del numbers["measures"]
+        yield facts | cost | {"mode": mode} | numbers | machine
+
+
+@torch.no_grad()
+def film(run: Path, seconds: float = 8.0) -> Iterator[Image.Image]:
+    """Yield pictures of the deterministic policy, 15 per second."""
+    _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+    state = env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for step in range(round(30 * seconds)):
+            action = agent.actor.policy(state.select("observation", "goal"))["action"]
+            _, state = env.step_and_maybe_reset(state.set("action", action))
+            if step % 2:
+                picture = Image.fromarray(env.render(width=320, height=240, distance=3.5).numpy())
+                yield picture.quantize(64)
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
