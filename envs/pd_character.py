@@ -159,9 +159,10 @@ def add_ground(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground", contype=1, conaffinity=1
     )
-    spec.worldbody.add_light(
-        name="sun", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 10], dir=[-0.3, 0.4, -1]
-    )
+    # The light follows the character, for shadows are drawn near where it shines.
+    sun, follow = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_TRACK
+    spec.bodies[1].add_light(name="sun", type=sun, mode=follow, pos=[3, -4, 10], dir=[-0.3, 0.4, -1])
+    spec.visual.map.shadowclip = 20.0  # where the map of shadows ends the ground is speckled
 
 
 def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int) -> tuple[Tensor, Tensor, Tensor]:
