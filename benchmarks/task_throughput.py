@@ -44,10 +44,10 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1024
 
 
-def raw(env: envs.PDCharacterEnv, script: torch.Tensor) -> Callable[[int], None]:
+def raw(env: envs.PDCharacterEnv, script: torch.Tensor, threads: int) -> Callable[[int], None]:
     """A step of MuJoCo alone in the scene of ``env``."""
     model = env.simulation.model
-    batch = Batch(model, env.num_envs, 0, True)
+    batch = Batch(model, env.num_envs, threads, True)
     batch.reset()
     ctrl, qpos = batch.bind("ctrl"), batch.bind("qpos")
     controls = (script.double() * torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5])).numpy()
@@ -73,18 +73,18 @@ def ours(env: envs.PDCharacterEnv, script: torch.Tensor) -> Callable[[int], None
     return step
 
 
-def measure(task: str, character: str, num_envs: int, turns: int, steps: int) -> dict[str, Any]:
+def measure(task: str, character: str, num_envs: int, turns: int, steps: int, threads: int) -> dict[str, Any]:
     """Let bare MuJoCo and the task take turns."""
     torch.set_num_threads(1)
     getattr(envs, task)(character=character, num_envs=1).reset()
     gc.collect()
     before = resident()
-    env = getattr(envs, task)(character=character, num_envs=num_envs, seed=0)
+    env = getattr(envs, task)(character=character, num_envs=num_envs, seed=0, num_threads=threads)
     generator = torch.Generator().manual_seed(0)
     script = torch.rand(32, *env.action_spec.shape, generator=generator) * 0.6 - 0.3
     contender = ours(env, script)
     memory = (resident() - before) / num_envs
-    contenders, seconds = {"raw": raw(env, script), "ours": contender}, {"raw": [], "ours": []}
+    contenders, seconds = {"raw": raw(env, script, threads), "ours": contender}, {"raw": [], "ours": []}
     physics = []
     for turn in range(turns + 1):
         for name, step in contenders.items():
@@ -107,12 +107,12 @@ def measure(task: str, character: str, num_envs: int, turns: int, steps: int) ->
     }
 
 
-def rows(tasks: list[str], characters: list[str], sizes: list[int], turns: int, steps: int) -> Iterator[dict[str, Any]]:
+def rows(tasks: list[str], characters: list[str], sizes: list[int], *settings: int) -> Iterator[dict[str, Any]]:
     """Measure each pair and size in a process of its own."""
     for task in tasks:
         for character in characters:
             for num_envs in sizes:
-                job = json.dumps([task, character, num_envs, turns, steps])
+                job = json.dumps([task, character, num_envs, *settings])
                 done = subprocess.run(
                     [sys.executable, __file__, "--job", job], stdout=subprocess.PIPE, text=True, check=True
                 )
@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one character, few simulations and turns")
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--characters", nargs="+", default=list(envs.characters.CHARACTERS))
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads of the physics")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--job", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -135,9 +136,9 @@ def main() -> None:
         return
     sizes, turns, steps = ([8], 2, 3) if arguments.quick else (list(SIZES), 10, 25)
     characters = arguments.characters[:1] if arguments.quick else arguments.characters
-    conditions = {"turns": turns, "steps": steps, "threads": 1, **about()}
+    conditions = {"turns": turns, "steps": steps, "threads": arguments.threads, **about()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()))
-    measured = list(rows(arguments.tasks, characters, sizes, turns, steps))
+    measured = list(rows(arguments.tasks, characters, sizes, turns, steps, arguments.threads))
     print(table(measured))
     print(f"least of raw: {min(row['of_raw'] for row in measured)} (aim {AIM})")
     if output := arguments.output or (None if arguments.quick else RESULTS):

@@ -61,3 +61,20 @@ def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
         for side in ("reuse_ms", "no_reuse_ms"):
             assert 0 < float(row[f"{side}_min"]) <= float(row[side])
         assert float(row["ratio"]) > 0
+
+
+@pytest.mark.parametrize("what", ["timestep", "stress"])
+def test_characters_are_measured(tmp_path, what):
+    rows = run("characters.py", tmp_path / "out.csv", what, "--characters", "biped")
+    assert {row["character"] for row in rows} == {"biped"}
+    if what == "timestep":
+        assert all(0 < float(row["smooth"]) < 0.1 for row in rows)
+    else:
+        assert all(row["diverged"] == "0" for row in rows)
+
+
+def test_tasks_are_measured_beside_bare_mujoco(tmp_path):
+    rows = run("task_throughput.py", tmp_path / "out.csv", "--tasks", "Heading", "--characters", "biped")
+    (row,) = rows
+    assert float(row["of_raw"]) > 0
+    assert 0 < float(row["physics"]) < 1

@@ -9,6 +9,7 @@ from zipfile import BadZipFile
 
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.assembly import HUMANS
+from torchrl_mcp.envs.motions.feasibility import feasibility
 from torchrl_mcp.envs.motions.importer import import_motion
 from torchrl_mcp.envs.motions.pictures import contact_sheet, save_film, save_picture
 from torchrl_mcp.envs.motions.summary import Summary, summary
@@ -33,12 +34,26 @@ PAPER_CORPUS = {
     "0005_Walking001.bvh": 39.09,
     "humanoid3d_walk.txt": 1.27,
 }
-"""Seconds of each file. With mirror images of all but the last, which loops, they make the 230 s of appendix B."""
+"""Seconds of each file. With mirror images of all but the last, which loops, they make the 230 s of appendix C."""
 
 SOURCES = {
     ".txt": "https://github.com/xbpeng/DeepMimic, data/motions",
     ".bvh": "https://mocap.cs.sfu.ca, subject 0005, Walking001",
 }
+
+COLUMNS = (
+    "clip",
+    "character",
+    "seconds",
+    "frames/s",
+    "m/s",
+    "|rad/s|",
+    "slide m/s",
+    "beyond limits",
+    "below ground",
+    "torque/limit",
+)
+"""Of the table, from :mod:`~torchrl_mcp.envs.motions.summary` and :mod:`~torchrl_mcp.envs.motions.feasibility`."""
 
 SLIDING = 0.2
 """m/s. The feet of a motion that is read correctly slide less, those of one that is not more."""
@@ -100,7 +115,7 @@ def _load(arguments: argparse.Namespace) -> dict[str, MotionClip]:
     clips: dict[str, MotionClip] = {}
     for path in arguments.files:
         if path.stem in clips:
-            raise ValueError(f"two files are called {path.stem}: name them apart, or give them one after the other")
+            raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
         if path.suffix == ".npz":
             clips[path.stem] = MotionClip.load(path)
             continue
@@ -112,7 +127,7 @@ def _load(arguments: argparse.Namespace) -> dict[str, MotionClip]:
             scale=arguments.scale,
             joint_map=_joint_map(arguments.map),
             skip=arguments.skip,
-            rest_frame=None if arguments.rest_frame is None else arguments.rest_frame - 1,
+            rest_frame=arguments.rest_frame,
             asf=arguments.asf,
         )
     return clips
@@ -128,26 +143,32 @@ def _save(clips: Mapping[str, MotionClip], folder: Path) -> None:
 
 def _table(clips: Mapping[str, MotionClip]) -> str:
     """Return a line for each clip, and warn of those whose feet slide."""
-    rows = [("clip", "for", "seconds", "frames/s", "m/s", "|rad/s|", "slide m/s", "beyond limits")]
     summaries = {name: summary(clip) for name, clip in clips.items()}
-    for name, numbers in summaries.items():
-        clip = clips[name]
-        rate = f"{clip.fps:.4g}{' loop' if clip.loop else ''}"
-        rows.append((name, clip.character, f"{numbers.duration:.2f}", rate, *_cells(numbers)))
-    rows.append(("total", "", f"{sum(numbers.duration for numbers in summaries.values()):.1f}", *[""] * 5))
+    rows = [COLUMNS, *(_row(name, clip, summaries[name]) for name, clip in clips.items())]
+    rows.append(("total", "", f"{sum(numbers.duration for numbers in summaries.values()):.1f}", *[""] * 7))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-    sliding = [name for name, numbers in summaries.items() if numbers.slide > SLIDING]
-    if sliding:
+    if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
         lines.append(
             f"The feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
         )
     return "\n".join(lines)
 
 
-def _cells(numbers: Summary) -> tuple[str, str, str, str]:
-    slide = "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}"
-    return f"{numbers.speed:.2f}", f"{numbers.turn_rate:.2f}", slide, f"{math.degrees(numbers.excess):.1f} deg"
+def _row(name: str, clip: MotionClip, numbers: Summary) -> tuple[str, ...]:
+    demand = feasibility(clip)
+    return (
+        name,
+        clip.character,
+        f"{numbers.duration:.2f}",
+        f"{clip.fps:.4g}{' loop' if clip.loop else ''}",
+        f"{numbers.speed:.2f}",
+        f"{numbers.turn_rate:.2f}",
+        "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
+        f"{math.degrees(demand.limit):.1f} deg",
+        f"{100 * demand.penetration:.1f} cm",
+        f"{demand.torque:.2f}",
+    )
 
 
 def _joint_map(pairs: list[str]) -> dict[str, str] | None:
@@ -178,7 +199,7 @@ def _parser() -> argparse.ArgumentParser:
         "--skip", type=int, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
     )
     source.add_argument(
-        "--rest-frame", type=int, metavar="N", help="frame (from 1) that stands, if the rest pose does not"
+        "--rest-frame", type=int, metavar="N", help="frame, from 0, that stands, if the rest pose does not"
     )
     source.add_argument("--asf", type=Path, help="skeleton of .amc files, if it is not beside them")
 

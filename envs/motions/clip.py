@@ -164,10 +164,11 @@ class MotionClip:
 
     def _locate(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Frame before each time, fraction of the way to the next, and number of cycles completed."""
+        times = times.double()
         cycles = torch.floor(times / self.duration) if self.loop else torch.zeros_like(times)
-        position = ((times - cycles * self.duration).double() * self.fps).clamp(0, len(self.qpos) - 1)
+        position = ((times - cycles * self.duration) * self.fps).clamp(0, len(self.qpos) - 1)
         frame = position.long().clamp(max=len(self.qpos) - 2)
-        return frame, position - frame, cycles.double()
+        return frame, position - frame, cycles
 
     def _within(self, times: Tensor) -> Tensor:
         """State at times within the first cycle, the end included."""

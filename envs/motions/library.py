@@ -143,8 +143,8 @@ class MotionLibrary:
 def _rows(clip: MotionClip) -> list[Tensor]:
     """All that is known of every frame, each ``(T, *)``.
 
-    Quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, ``qvel``. Vectors and
-    quaternions are stored component by component, which is several times as fast as body by body.
+    Quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, ``qvel``. Vectors
+    and quaternions are stored component by component, which is several times as fast as body by body.
     """
     layout, bodies = clip.layout, body_states(clip.character, clip.qpos, clip.qvel)
     turns = continuous(torch.cat([clip.qpos[:, layout.quaternions], bodies.orientations], dim=1).transpose(0, 1))

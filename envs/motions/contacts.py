@@ -1,0 +1,68 @@
+"""Points at which feet can touch the ground."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names
+from torchrl_mcp.envs.rotations import rotate
+
+
+class ContactPoints(NamedTuple):
+    """Points of a body over time: the corners of its boxes, the undersides of its spheres and of the ends of capsules.
+
+    Args:
+        positions: In the world, shape ``(T, P, 3)``, in metres.
+        velocities: Of the material there, shape ``(T, P, 3)``, in m/s.
+        offsets: Within the body, apart from the radius of what is round, shape ``(P, 3)``.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    offsets: Tensor
+
+
+def contact_points(character: str, body: str, states: BodyStates) -> ContactPoints:
+    """Follow the points of one body.
+
+    Args:
+        character: Name of the character.
+        body: Name of a body of it.
+        states: Of all its bodies, from :func:`~torchrl_mcp.envs.motions.kinematics.body_states`, T frames.
+    """
+    offsets, radii = _outline(character_model(character), body)
+    index = body_names(character).index(body)
+    orientation = states.orientations[:, index].unsqueeze(1)
+    arms = rotate(orientation, offsets)
+    arms = torch.cat([arms[..., :2], arms[..., 2:] - radii.unsqueeze(-1)], dim=-1)
+    spin = states.angular_velocities[:, index].unsqueeze(1).expand_as(arms)
+    return ContactPoints(
+        positions=states.positions[:, index].unsqueeze(1) + arms,
+        velocities=states.linear_velocities[:, index].unsqueeze(1) + torch.linalg.cross(spin, arms),
+        offsets=offsets,
+    )
+
+
+def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
+    """Points ``(P, 3)`` in the frame of a body and the radius ``(P,)`` of what is round about them."""
+    points, radii = [], []
+    owner = model.body(body)
+    for index in range(owner.geomadr[0], owner.geomadr[0] + owner.geomnum[0]):
+        geom = model.geom(index)
+        size = geom.size
+        match geom.type[0]:
+            case mujoco.mjtGeom.mjGEOM_SPHERE:
+                local, radius = np.zeros((1, 3)), size[0]
+            case mujoco.mjtGeom.mjGEOM_CAPSULE:
+                local, radius = np.array([[0, 0, -size[1]], [0, 0, size[1]]]), size[0]
+            case _:
+                local, radius = size * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(8, 3), 0.0
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, geom.quat)
+        points.append(geom.pos + local @ matrix.reshape(3, 3).T)
+        radii.append(np.full(len(local), radius))
+    return torch.from_numpy(np.concatenate(points)), torch.from_numpy(np.concatenate(radii))

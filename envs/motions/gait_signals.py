@@ -1,0 +1,164 @@
+"""What a walk looks like from its own direction of progression: angles and places over time."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv1d, pad
+
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.contacts import contact_points
+from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names
+from torchrl_mcp.envs.rotations import heading, rotate
+
+
+class Root(NamedTuple):
+    """Of pelvis and trunk, each ``(T,)`` unless stated, in metres, seconds and degrees but for the heading.
+
+    Args:
+        position: On the ground, shape ``(T, 2)``.
+        path: The same, smoothed.
+        heading: Smoothed, in radians.
+        speed: Along the heading.
+        height: Of the root.
+        sway: To the left of the path.
+        pelvis_yaw: Relative to the heading.
+        pelvis_list: Left side up.
+        trunk_yaw: Relative to the heading.
+        trunk_roll: To the left.
+    """
+
+    position: Tensor
+    path: Tensor
+    heading: Tensor
+    speed: Tensor
+    height: Tensor
+    sway: Tensor
+    pelvis_yaw: Tensor
+    pelvis_list: Tensor
+    trunk_yaw: Tensor
+    trunk_roll: Tensor
+
+
+class Leg(NamedTuple):
+    """Of a leg and the arm on its side, each ``(T,)``, in metres, m/s and degrees.
+
+    Args:
+        ahead: Of the ankle, along the heading from the root.
+        toe_ahead: Of the toes.
+        across: Of the ankle, to the left of the path.
+        thigh: Angle forward from the vertical.
+        knee: Flexion.
+        ankle: Dorsiflexion in the plane of progression.
+        pitch: Of the foot, toes up.
+        toe_height: Of the sole at the toes.
+        ankle_speed: Horizontal.
+        arm: Angle of the upper arm forward from the vertical; NaN without arms, as is the next.
+        elbow: Flexion.
+    """
+
+    ahead: Tensor
+    toe_ahead: Tensor
+    across: Tensor
+    thigh: Tensor
+    knee: Tensor
+    ankle: Tensor
+    pitch: Tensor
+    toe_height: Tensor
+    ankle_speed: Tensor
+    arm: Tensor
+    elbow: Tensor
+
+
+def root_signals(clip: MotionClip, states: BodyStates, window: float) -> Root:
+    """Follow pelvis and trunk.
+
+    Args:
+        clip: Of T frames.
+        states: Of its bodies.
+        window: Length in seconds of the Hann window that smooths path and heading.
+    """
+    trunk = states.orientations[:, 1]  # the body above the pelvis
+    pelvis = states.orientations[:, 0]
+    yaw = unwrapped(heading(pelvis))
+    facing = smoothed(yaw, clip.fps, window)
+    position = states.positions[:, 0, :2]
+    path = smoothed(position.T, clip.fps, window).T
+    forward, left = _axes(facing)
+    return Root(
+        position=position,
+        path=path,
+        heading=facing,
+        speed=(states.linear_velocities[:, 0, :2] * forward).sum(-1),
+        height=states.positions[:, 0, 2],
+        sway=((position - path) * left).sum(-1),
+        pelvis_yaw=torch.rad2deg(yaw - facing),
+        pelvis_list=torch.rad2deg(_axis(pelvis, 1)[:, 2].asin()),
+        trunk_yaw=torch.rad2deg(unwrapped(heading(trunk)) - facing),
+        trunk_roll=_inclination(_axis(trunk, 2), left),
+    )
+
+
+def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: Root) -> Leg:
+    """Follow the leg and the arm of a side, ``"right"`` or ``"left"``."""
+    names, model = body_names(clip.character), character_model(clip.character)
+    forward, left = _axes(root.heading)
+    foot = names.index(f"{side}_ankle")
+    ankle = states.positions[:, foot, :2]
+    points = contact_points(clip.character, names[foot], states)
+    at_toes = points.offsets[:, 0] > points.offsets[:, 0].mean()
+    toes = points.positions[:, at_toes & (points.offsets[:, 2] < points.offsets[:, 2].mean())].mean(1)
+    thigh = _inclination(-_axis(states.orientations[:, names.index(f"{side}_hip")], 2), forward)
+    knee = -torch.rad2deg(clip.qpos[:, model.joint(f"{side}_knee").qposadr[0]])
+    sole = _axis(states.orientations[:, foot], 0)
+    pitch = torch.rad2deg(torch.atan2(sole[:, 2], (sole[:, :2] * forward).sum(-1)))
+    arm = elbow = torch.full_like(knee, torch.nan)
+    if f"{side}_elbow" in names:
+        arm = _inclination(-_axis(states.orientations[:, names.index(f"{side}_shoulder")], 2), forward)
+        elbow = torch.rad2deg(clip.qpos[:, model.joint(f"{side}_elbow").qposadr[0]])
+    return Leg(
+        ahead=((ankle - root.position) * forward).sum(-1),
+        toe_ahead=((toes[:, :2] - root.position) * forward).sum(-1),
+        across=((ankle - root.path) * left).sum(-1),
+        thigh=thigh,
+        knee=knee,
+        ankle=pitch - thigh + knee,
+        pitch=pitch,
+        toe_height=toes[:, 2],
+        ankle_speed=torch.linalg.vector_norm(states.linear_velocities[:, foot, :2], dim=-1),
+        arm=arm,
+        elbow=elbow,
+    )
+
+
+def smoothed(values: Tensor, fps: float, window: float) -> Tensor:
+    """Average over time, the last dimension, by a Hann window of a length in seconds; the ends are held."""
+    half = max(1, min(round(window * fps / 2), values.shape[-1] - 1))
+    weights = torch.hann_window(2 * half + 1, periodic=False, dtype=values.dtype)
+    held = pad(values.reshape(-1, 1, values.shape[-1]), (half, half), mode="replicate")
+    return conv1d(held, (weights / weights.sum()).view(1, 1, -1)).view_as(values)
+
+
+def unwrapped(angles: Tensor) -> Tensor:
+    """Remove jumps of full turns from angles over time, shape ``(T,)``."""
+    steps = angles.diff()
+    return angles + torch.cat(
+        [torch.zeros_like(angles[:1]), -(steps / (2 * torch.pi)).round().cumsum(0) * 2 * torch.pi]
+    )
+
+
+def _axes(facing: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors on the ground forward and to the left of headings ``(T,)``, each ``(T, 2)``."""
+    cosine, sine = facing.cos(), facing.sin()
+    return torch.stack([cosine, sine], dim=-1), torch.stack([-sine, cosine], dim=-1)
+
+
+def _axis(orientations: Tensor, index: int) -> Tensor:
+    """One of the bodies' own axes in the world, shape ``(T, 3)``."""
+    return rotate(orientations, torch.eye(3, dtype=orientations.dtype)[index])
+
+
+def _inclination(axis: Tensor, towards: Tensor) -> Tensor:
+    """Degrees, shape ``(T,)``, by which axes ``(T, 3)`` lean from the vertical towards directions ``(T, 2)``."""
+    return torch.rad2deg(torch.atan2((axis[:, :2] * towards).sum(-1), axis[:, 2].abs()))

@@ -1,0 +1,125 @@
+"""Motion as files hold it: a skeleton of any shape, and what its joints do."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.rotations import multiply, rotate
+
+AXES = torch.eye(3, dtype=torch.float64)
+"""Unit vectors x, y and z."""
+
+
+class Pose(NamedTuple):
+    """Where the joints are, in the axes and the unit of the file.
+
+    Attributes:
+        positions: Shape ``(*B, J, 3)``.
+        rotations: Quaternions from the rest pose, in which they are identity, shape ``(*B, J, 4)``.
+    """
+
+    positions: Tensor
+    rotations: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class SourceMotion:
+    """A recorded motion on the skeleton that it came with.
+
+    A joint turns and shifts all that hangs on it. In the rest pose no joint is turned.
+
+    Args:
+        path: The file.
+        names: Of the J joints, each after its parent.
+        parents: Index of each joint's parent, -1 for one without.
+        translations: Position of each joint in the frame of its parent, shape ``(T, J, 3)``.
+        rotations: Of each joint relative to its parent, shape ``(T, J, 4)``.
+        fps: Frames per second.
+        unit: Metres per unit of length, or None where the file does not say.
+        lines: Line at which each frame begins.
+    """
+
+    path: Path
+    names: Sequence[str]
+    parents: Sequence[int]
+    translations: Tensor
+    rotations: Tensor
+    fps: float
+    unit: float | None
+    lines: Sequence[int]
+
+    @property
+    def rest(self) -> Pose:
+        """The rest pose, with the mean lengths of the motion, shapes ``(J, 3)`` and ``(J, 4)``."""
+        return _forward_kinematics(self.parents, self.translations.mean(0), identities(len(self.names)))
+
+    def poses(self) -> Pose:
+        """The poses in motion, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
+        return _forward_kinematics(self.parents, self.translations, self.rotations)
+
+    def pose(self, frame: int) -> Pose:
+        """The pose in one frame, from 0, shapes ``(J, 3)`` and ``(J, 4)``.
+
+        Raises:
+            ValueError: If there is no such frame.
+        """
+        if not 0 <= frame < len(self.lines):
+            raise ValueError(f"rest_frame={frame} does not exist: pass one of 0..{len(self.lines) - 1}")
+        return _forward_kinematics(self.parents, self.translations[frame], self.rotations[frame])
+
+    def without_first(self, frames: int) -> Self:
+        """Leave out frames at the beginning.
+
+        Raises:
+            ValueError: If less than two would remain.
+        """
+        if not 0 <= frames <= len(self.lines) - 2:
+            raise ValueError(f"skip={frames} leaves less than two frames of {len(self.lines)}: pass a smaller number")
+        return replace(
+            self,
+            translations=self.translations[frames:],
+            rotations=self.rotations[frames:],
+            lines=self.lines[frames:],
+        )
+
+    def ancestors(self, joint: int) -> list[int]:
+        """Return the joint itself, its parent and so on up to the root."""
+        chain = [joint]
+        while self.parents[chain[-1]] >= 0:
+            chain.append(self.parents[chain[-1]])
+        return chain
+
+
+def frame_rate(fps: float | None, stated: float = 0.0) -> float:
+    """Return the frames per second that a user gives, or those that a file states.
+
+    Raises:
+        ValueError: If what the user gives is no frame rate.
+    """
+    if fps is None:
+        return stated
+    if not 1.0 <= fps <= 10_000.0:
+        raise ValueError(f"fps={fps} is no frame rate of a recording: pass a number from 1 to 10000")
+    return fps
+
+
+def identities(*shape: int) -> Tensor:
+    """Rotations by nothing, shape ``(*shape, 4)``."""
+    return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(*shape, 1)
+
+
+def _forward_kinematics(parents: Sequence[int], translations: Tensor, rotations: Tensor) -> Pose:
+    positions: list[Tensor] = []
+    turned: list[Tensor] = []
+    for joint, parent in enumerate(parents):
+        shift, turn = translations[..., joint, :], rotations[..., joint, :]
+        if parent >= 0:
+            shift = positions[parent] + rotate(turned[parent], shift)
+            turn = multiply(turned[parent], turn)
+        positions.append(shift)
+        turned.append(turn)
+    return Pose(torch.stack(positions, dim=-2), torch.stack(turned, dim=-2))

@@ -1,0 +1,142 @@
+"""Text files of numbers, read line by line with errors that name the line."""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+
+LARGEST_FILE = 64 * 2**20
+"""Bytes: a quarter of an hour of a whole body at 120 Hz."""
+
+LARGEST_NUMBER = 1e7
+"""No position, in any unit, and no angle in degrees is larger."""
+
+LARGEST_SKELETON = 1000
+"""Joints."""
+
+LARGEST_MOTION = 5_000_000
+"""Frames times joints, of which each takes a few hundred bytes."""
+
+
+class Statement(NamedTuple):
+    """A line, or a part of one, as words.
+
+    Attributes:
+        line: Number of the line, from 1.
+        words: At least one.
+    """
+
+    line: int
+    words: list[str]
+
+
+@dataclass(frozen=True)
+class TextFile:
+    """The text of a motion file.
+
+    Args:
+        path: Where it is from.
+        text: What it holds.
+    """
+
+    path: Path
+    text: str
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read a file with any line endings; bytes that are not UTF-8 become replacement characters.
+
+        Raises:
+            MotionFormatError: If it cannot be read, or is too large to be a motion.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as file:
+                content = file.read(LARGEST_FILE + 1)
+        except (OSError, ValueError) as error:
+            raise MotionFormatError(path, f"cannot be read: {error}") from error
+        if len(content) > LARGEST_FILE:
+            raise MotionFormatError(path, f"is larger than {LARGEST_FILE // 2**20} MiB: split it")
+        return cls(path, re.sub(r"\r\n?", "\n", content.decode("utf-8-sig", errors="replace")))
+
+    def statements(self, *, separators: str = "", comment: str = "") -> Iterator[Statement]:
+        """Iterate over the lines that are not blank, as words.
+
+        Args:
+            separators: Characters that are statements of their own wherever they stand.
+            comment: What begins a comment, which lasts to the end of the line.
+        """
+        for number, line in enumerate(self.text.split("\n"), start=1):
+            content = line.partition(comment)[0] if comment else line
+            parts = re.split(f"([{re.escape(separators)}])", content) if separators else [content]
+            yield from (Statement(number, words) for part in parts if (words := part.split()))
+
+    def error(self, message: str, line: int | None = None) -> MotionFormatError:
+        """Return an error to be raised about this file."""
+        return MotionFormatError(self.path, message, line)
+
+    def numbers(self, words: Sequence[str], line: int) -> list[float]:
+        """Convert words to finite numbers.
+
+        Raises:
+            MotionFormatError: If one is not.
+        """
+        numbers = [_number(word) for word in words]
+        for word, number in zip(words, numbers, strict=True):
+            if number is None:
+                raise self.error(f"{shortened(word)} is no number: correct it", line)
+            if not abs(number) <= LARGEST_NUMBER:
+                kind = "absurdly large" if math.isfinite(number) else "not finite"
+                raise self.error(f"{shortened(word)} is {kind}: correct it", line)
+        return [number for number in numbers if number is not None]
+
+    def number(self, statement: Statement) -> float:
+        """Convert the word that follows a keyword to a number.
+
+        Raises:
+            MotionFormatError: If there is not just one.
+        """
+        [number] = self._following(statement, 1)
+        return number
+
+    def vector(self, statement: Statement) -> list[float]:
+        """Convert the words that follow a keyword to three numbers.
+
+        Raises:
+            MotionFormatError: If there are not three.
+        """
+        return self._following(statement, 3)
+
+    def require_size(self, frames: int, joints: int) -> None:
+        """Refuse a motion that would fill the memory: a joint without channels takes no text.
+
+        Raises:
+            MotionFormatError: If it is larger than any recording.
+        """
+        if joints > LARGEST_SKELETON:
+            raise self.error(f"has more than {LARGEST_SKELETON} joints: pass a file of one body")
+        if frames * joints > LARGEST_MOTION:
+            raise self.error(f"has {frames} frames of {joints} joints, which is more than {LARGEST_MOTION}: split it")
+
+    def _following(self, statement: Statement, count: int) -> list[float]:
+        keyword, *words = statement.words
+        if len(words) != count:
+            message = f"{shortened(keyword)} is followed by {len(words)} words and should be by {count}: correct it"
+            raise self.error(message, statement.line)
+        return self.numbers(words, statement.line)
+
+
+def shortened(word: str) -> str:
+    """Quote a word, or its beginning if it is long."""
+    return repr(word if len(word) <= 30 else f"{word[:27]}...")
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None

@@ -1,0 +1,364 @@
+import json
+from contextlib import suppress
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from torchrl_mcp.envs.motions import textfile
+from torchrl_mcp.envs.motions.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.motions.joints import character_model
+
+BALLS = [1.0, 0.0, 0.0, 0.0]
+HUMANOID = ["root", "chest", "neck", "right_hip", "right_knee", "right_ankle", "right_shoulder", "right_elbow"]
+HUMANOID += ["left_hip", "left_knee", "left_ankle", "left_shoulder", "left_elbow"]
+BIPED = ["root", "torso", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"]
+
+
+def frame(joints, *, duration=0.1, position=(0.0, 0.9, 0.0), **values):
+    """One frame in DeepMimic's axes: x forward, y up, z right."""
+    columns = [duration, *position]
+    for joint in joints:
+        hinge = joint.endswith(("knee", "elbow"))
+        columns += [values.get(joint, 0.0)] if hinge else list(values.get(joint, BALLS))
+    return columns
+
+
+def quaternion(axis, degrees):
+    return Rotation.from_rotvec(np.radians(degrees) * np.array(axis, float)).as_quat(scalar_first=True).tolist()
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(frames, loop="none", text=None):
+        path = tmp_path / "motion.txt"
+        path.write_text(json.dumps({"Loop": loop, "Frames": frames}) if text is None else text)
+        return path
+
+    return write
+
+
+def bodies(clip, index=0):
+    """Body positions by name, from MuJoCo."""
+    model = character_model(clip.character)
+    data = mujoco.MjData(model)
+    data.qpos = clip.qpos[index].numpy()
+    mujoco.mj_kinematics(model, data)
+    return {model.body(i).name: data.xpos[i].copy() for i in range(1, model.nbody)}
+
+
+def of_joint(clip, name, index=0):
+    joint = character_model(clip.character).joint(name)
+    return clip.qpos[index, joint.qposadr[0] :][: 4 if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL else 1].tolist()
+
+
+def test_standing_faces_forward_with_the_soles_on_the_ground(write):
+    clip = read_deepmimic(write([frame(HUMANOID), frame(HUMANOID)]), "humanoid")
+    found = bodies(clip)
+    np.testing.assert_allclose(found["root"], [0, 0, 0.881416], atol=1e-6)
+    assert found["right_hip"][1] < 0 < found["left_hip"][1]
+    np.testing.assert_allclose(found["left_ankle"], [0, 0.084887, 0.05], atol=1e-6)
+
+
+def test_the_root_moves_forward_up_and_to_the_right(write):
+    start, end = (0.3, 0.9, 0.2), (1.3, 1.0, 0.4)
+    clip = read_deepmimic(write([frame(HUMANOID, position=start), frame(HUMANOID, position=end)]), "humanoid", rate=10)
+    np.testing.assert_allclose(clip.qpos[1, :3] - clip.qpos[0, :3], [1.0, -0.2, 0.1], atol=1e-9)
+    np.testing.assert_allclose(clip.qpos[0, :2], [0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("joint", "rotation", "body", "direction"),
+    [
+        ("right_hip", quaternion([0, 0, 1], 60), "right_knee", [np.sin(np.pi / 3), 0, -0.5]),  # forward
+        ("left_hip", quaternion([1, 0, 0], 60), "left_knee", [0, np.sin(np.pi / 3), -0.5]),  # outward
+        ("right_shoulder", quaternion([0, 0, 1], 90), "right_elbow", [1, 0, 0]),  # forward
+        ("right_shoulder", quaternion([1, 0, 0], -60), "right_elbow", [0, -np.sin(np.pi / 3), -0.5]),  # outward
+        ("left_knee", -np.pi / 2, "left_ankle", [-1, 0, 0]),  # backward
+        ("right_elbow", np.pi / 2, "right_wrist", [1, 0, 0]),  # forward
+    ],
+)
+def test_a_positive_rotation_about_an_axis_moves_the_limb_as_in_deepmimic(write, joint, rotation, body, direction):
+    found = bodies(read_deepmimic(write([frame(HUMANOID, **{joint: rotation})] * 2), "humanoid"))
+    moved = found[body] - found[joint]
+    np.testing.assert_allclose(moved / np.linalg.norm(moved), direction, atol=1e-9)
+
+
+def test_a_turn_to_the_left_is_a_turn_to_the_left(write):
+    found = bodies(read_deepmimic(write([frame(HUMANOID, root=quaternion([0, 1, 0], 90))] * 2), "humanoid"))
+    np.testing.assert_allclose(found["left_hip"] - found["right_hip"], [-2 * 0.084887, 0, 0], atol=1e-9)
+
+
+def test_joints_keep_their_angles(write):
+    rotation = quaternion([0.6, 0.0, 0.8], 20)
+    moved = frame(HUMANOID, chest=rotation, neck=rotation, left_ankle=rotation, left_elbow=0.3, right_knee=-0.4)
+    clip = read_deepmimic(write([moved, moved]), "humanoid")
+    w, x, y, z = rotation
+    for joint in ("chest", "neck", "left_ankle"):
+        np.testing.assert_allclose(of_joint(clip, joint), [w, x, -z, y], atol=1e-12)
+    assert of_joint(clip, "left_elbow") == [0.3]
+    assert of_joint(clip, "right_knee") == [-0.4]
+
+
+def test_joints_stay_within_the_limits_of_the_character(write):
+    beyond = frame(HUMANOID, right_knee=0.2, left_knee=-3.5, chest=quaternion([0, 0, 1], 90))
+    clip = read_deepmimic(write([beyond, beyond]), "humanoid")
+    assert of_joint(clip, "right_knee") == [0.0]
+    assert of_joint(clip, "left_knee") == [-3.14]
+    np.testing.assert_allclose(of_joint(clip, "chest"), [np.cos(0.6), 0, -np.sin(0.6), 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("joints", [HUMANOID, BIPED], ids=["humanoid's file", "biped's file"])
+@pytest.mark.parametrize("character", ["humanoid", "biped"])
+def test_either_character_reads_the_files_of_both(write, joints, character):
+    lean, bend = quaternion([0, 0, 1], -10), {"left_knee": -0.5, "right_ankle": quaternion([0, 0, 1], 15)}
+    moved = frame(joints, chest=lean, torso=lean, **bend)
+    clip = read_deepmimic(write([moved, moved]), character)
+    assert clip.character == character
+    assert of_joint(clip, "left_knee") == [-0.5]
+    trunk = "torso" if character == "biped" else "chest"
+    np.testing.assert_allclose(of_joint(clip, trunk), [lean[0], 0, -lean[3], 0], atol=1e-12)
+    if character == "humanoid":
+        assert of_joint(clip, "left_shoulder") == BALLS
+
+
+@pytest.mark.parametrize(("loop", "expected"), [("wrap", True), ("none", False), (True, True), (False, False)])
+def test_the_loop_may_be_a_word_or_a_boolean(write, loop, expected):
+    assert read_deepmimic(write([frame(HUMANOID)] * 3, loop), "humanoid").loop is expected
+
+
+def test_the_clip_is_as_long_as_all_durations_but_the_last(write):
+    frames = [frame(HUMANOID, duration=duration) for duration in (0.1, 0.2, 0.3, 7.0)]
+    clip = read_deepmimic(write(frames), "humanoid", rate=20)
+    assert clip.duration == pytest.approx(0.6)
+    assert clip.fps == pytest.approx(20)
+
+
+def test_frames_of_unequal_duration_are_met_at_their_times(write):
+    places = [(0.0, 0.1), (1.0, 0.3), (2.0, 0.1), (5.0, 0.0)]
+    frames = [frame(HUMANOID, duration=duration, position=(x / 10, 0.9, 0.0)) for x, duration in places]
+    clip = read_deepmimic(write(frames), "humanoid", rate=10)
+    np.testing.assert_allclose(10 * clip.qpos[:, 0], [0, 1, 4 / 3, 5 / 3, 2, 5], atol=1e-9)
+
+
+def test_the_frame_rate_of_the_user_wins(write):
+    assert read_deepmimic(write([frame(HUMANOID)] * 7), "humanoid", fps=3).duration == pytest.approx(2.0)
+
+
+def test_a_loop_ends_in_the_pose_and_the_heading_with_which_it_began(write):
+    poses = [
+        {"root": quaternion([0, 1, 0], 7 * k), "left_knee": -0.3 - 0.1 * k, "position": (k, 0.9 + 0.01 * k, 0.0)}
+        for k in range(6)
+    ]
+    clip = read_deepmimic(write([frame(HUMANOID, **pose) for pose in poses], "wrap"), "humanoid", rate=10)
+    np.testing.assert_allclose(clip.qpos[-1, 2:], clip.qpos[0, 2:], atol=1e-12)
+    np.testing.assert_allclose(clip.qpos[:, 0], range(6), atol=1e-9)
+    np.testing.assert_allclose(clip.cycle.turn, 0.0, atol=1e-12)
+
+
+def test_the_cycle_of_a_loop_keeps_its_duration(write):
+    clip = read_deepmimic(write([frame(HUMANOID, duration=0.0333)] * 39, "wrap"), "humanoid", rate=30)
+    assert clip.duration == pytest.approx(38 * 0.0333)
+    assert clip.fps == pytest.approx(30, rel=0.01)
+
+
+def mirrored(columns, joints):
+    """Mirror one frame as the files define it: z -> -z, quaternion (w, -x, -y, z), left and right exchanged."""
+    duration, x, y, z, *rest = columns
+    values = {}
+    for joint in joints:
+        width = 1 if joint.endswith(("knee", "elbow")) else 4
+        value, rest = rest[:width], rest[width:]
+        side = {"right": "left", "left": "right"}.get(joint.partition("_")[0])
+        name = f"{side}_{joint.partition('_')[2]}" if side else joint
+        values[name] = value[0] if width == 1 else [value[0], -value[1], -value[2], value[3]]
+    return frame(joints, duration=duration, position=(x, y, -z), **values)
+
+
+@pytest.mark.parametrize(("joints", "character"), [(HUMANOID, "humanoid"), (BIPED, "biped")])
+def test_the_mirror_image_of_a_file_is_the_mirror_image_of_the_clip(write, joints, character):
+    rng = np.random.default_rng(0)
+    frames = [
+        frame(
+            joints,
+            position=rng.uniform(0.5, 1.0, 3).tolist(),
+            **{
+                joint: -abs(rng.normal()) / 4
+                if joint.endswith("knee")
+                else quaternion(rng.normal(size=3), rng.uniform(5, 20))
+                for joint in joints
+                if not joint.endswith("elbow")
+            },
+        )
+        for _ in range(4)
+    ]
+    clip = read_deepmimic(write(frames), character)
+    other = read_deepmimic(write([mirrored(columns, joints) for columns in frames]), character)
+    torch.testing.assert_close(other.qpos, clip.mirrored().qpos, rtol=0, atol=1e-12)
+
+
+STANDING = [frame(HUMANOID)] * 3
+JUMP = [frame(HUMANOID), frame(HUMANOID, position=(9, 1, 0)), frame(HUMANOID, position=(9, 1, 0))]
+
+
+def lines(frames):
+    """JSON with one frame a line, the first on line 3."""
+    rows = ",\n".join(json.dumps(columns) for columns in frames)
+    return '{"Loop": "none",\n"Frames": [\n' + rows + "\n]}\n"
+
+
+def damaged(column, value, which=1):
+    frames = [list(columns) for columns in STANDING]
+    frames[which][column] = value
+    return lines(frames)
+
+
+WRONG = {
+    "empty": ("", 1, "is not JSON"),
+    "truncated": (lines(STANDING)[:-40], 5, "is not JSON"),
+    "binary": ("\x00\x01", 1, "is not JSON"),
+    "list": ("[1, 2]", 1, "no list of two or more"),
+    "no frames": ('{"Loop": "none"}', 1, "no list of two or more"),
+    "frames no list": ('{"Frames": 3}', 1, "no list of two or more"),
+    "one frame": (lines(STANDING[:1]), 1, "no list of two or more"),
+    "unknown loop": (lines(STANDING).replace("none", "sometimes"), 1, "'sometimes'"),
+    "loop a list": (lines(STANDING).replace('"none"', "[1]"), 1, "Loop"),
+    "other character": (lines([columns[:36] for columns in STANDING]), 3, "the first frame has 36 numbers"),
+    "frames of words": ('{"Frames":\n["a", "b"]}', 1, "the first frame has 0 numbers"),
+    "truncated row": (lines([STANDING[0], STANDING[1][:43], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
+    "row too short for a frame": (lines([STANDING[0], [7], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
+    "NaN": (damaged(20, float("nan")), 4, "frame 2 holds what is no number"),
+    "infinity": (damaged(2, float("inf"), 2), 5, "frame 3 holds what is no number"),
+    "overflow": (lines(STANDING).replace("0.9", "1e999", 1), 3, "frame 1 holds what is no number"),
+    "absurd number": (damaged(2, 10**400), 4, "frame 2 holds what is no number"),
+    "word": (damaged(2, "high"), 4, "frame 2 holds what is no number"),
+    "boolean": (damaged(2, True), 4, "frame 2 holds what is no number"),
+    "null": (damaged(2, None), 4, "frame 2 holds what is no number"),
+    "no duration": (damaged(0, 0.0), 4, "frame 2 lasts 0 s"),
+    "negative duration": (damaged(0, -0.1), 4, "frame 2 lasts -0.1 s"),
+    "endless duration": (damaged(0, 9e6), 4, "frame 2 ends after 9e\\+06 s, more than an hour"),
+    "no rotation": (damaged(4, 0.0), 4, "quaternion of the root in frame 2 has length 0"),
+    "jump": (lines(JUMP), 4, "the root jumps between frames 1 and 2"),
+    "nested": ("[" * 100_000, 1, "is not JSON of a motion"),
+    "digits": ('{"Frames": [[' + "9" * 5000 + "]]}", 1, "is not JSON of a motion"),
+}
+
+
+@pytest.mark.parametrize(("text", "line", "message"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_said_with_file_and_line(write, text, line, message):
+    path = write(None, text=text)
+    with pytest.raises(MotionFormatError, match=message) as caught:
+        read_deepmimic(path, "humanoid")
+    assert str(caught.value).startswith(f"{path}:{line}: ")
+
+
+def test_a_file_too_large_to_be_a_motion_is_not_parsed(write, monkeypatch):
+    monkeypatch.setattr(textfile, "LARGEST_FILE", 2**20)
+    with pytest.raises(MotionFormatError, match="larger than 1 MiB"):
+        read_deepmimic(write(None, text="[]," * 2**19), "humanoid")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"character": "trex"}, "character='trex' has not the joints of a human body"),
+        ({"rate": 0}, "rate=0 leaves less than two frames"),
+        ({"rate": 1e9}, "rate=1000000000.0 leaves less"),
+        ({"fps": float("nan")}, "fps=nan is no frame rate"),
+    ],
+)
+def test_arguments_out_of_range_are_named(write, options, message):
+    with pytest.raises(ValueError, match=message):
+        read_deepmimic(write(STANDING), **{"character": "humanoid", **options})
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=5,
+)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 43), VALUES), max_size=3), VALUES, st.integers(0, 3000))
+def test_no_damage_raises_another_error(tmp_path_factory, damages, loop, cut):
+    frames = [list(columns) for columns in STANDING]
+    for which, column, value in damages:
+        frames[which][column] = value
+    path = tmp_path_factory.getbasetemp() / "damaged.txt"
+    path.write_text(json.dumps({"Loop": loop, "Frames": frames})[: 3000 - cut])
+    with suppress(MotionFormatError):
+        read_deepmimic(path, "humanoid")
+    path.write_text(json.dumps({"Loop": "wrap", "Frames": frames}))
+    with suppress(MotionFormatError):
+        read_deepmimic(path, "biped")
+
+
+FILES = {
+    "deepmimic/humanoid3d_walk.txt": (1.27, True),
+    "deepmimic/humanoid3d_jog.txt": (0.83, True),
+    "deepmimic/humanoid3d_long_walk1.txt": (32.79, False),
+    "deepmimic/humanoid3d_long_walk2.txt": (24.56, False),
+    "deepmimic/humanoid3d_long_walk3.txt": (17.74, False),
+    "sfu/0005_Walking001_retargeted_deepmimic_60hz.txt": (39.08, False),
+    "biped/biped3d_walk.txt": (1.0, True),
+}
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("character", ["humanoid", "biped"])
+def test_real_files_have_their_duration_and_stand_on_the_ground(mocap, file, character):
+    clip = read_deepmimic(mocap / file, character)
+    duration, loop = FILES[file]
+    assert clip.duration == pytest.approx(duration, abs=0.01)
+    assert clip.loop is loop
+    ankles = np.array([min(found["left_ankle"][2], found["right_ankle"][2]) for found in map_bodies(clip)])
+    assert 0.04 < np.quantile(ankles, 0.1) < 0.08
+    assert ankles.min() > 0.03
+
+
+def map_bodies(clip):
+    return [bodies(clip, index) for index in range(0, len(clip.qpos), 5)]
+
+
+@pytest.mark.parametrize(
+    ("file", "skeleton", "character"),
+    [
+        ("deepmimic/humanoid3d_long_walk3.txt", "deepmimic/humanoid3d_character.txt", "humanoid"),
+        ("biped/biped3d_walk.txt", "biped/biped3d_mocap_character.txt", "biped"),
+    ],
+)
+def test_bodies_are_where_the_skeleton_of_a_real_file_has_them(mocap, file, skeleton, character):
+    """All but the ends of the cycle of a loop, which are drawn together."""
+    joints = json.loads((mocap / skeleton).read_text())["Skeleton"]["Joints"]
+    frames = json.loads((mocap / file).read_text())["Frames"]
+    step = max(1, len(frames) // 30)
+    clip = read_deepmimic(mocap / file, character, rate=(len(frames) - 1) / sum(frame[0] for frame in frames[:-1]))
+    start = None
+    for index in range(0, len(frames), step):
+        places = skeleton_positions(joints, frames[index])
+        found = bodies(clip, index)
+        start = found["root"] - places["root"] if start is None else start
+        for name, place in places.items():
+            np.testing.assert_allclose(found[name], place + start, atol=2e-3 if clip.loop else 1e-6, err_msg=name)
+
+
+def skeleton_positions(joints, columns):
+    """Joint positions by rotation matrices, in our axes."""
+    axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    places, turns, rest = [np.array(columns[1:4])], [], list(columns[4:])
+    for joint in joints:
+        width = {"none": 4, "spherical": 4, "revolute": 1, "fixed": 0}[joint["Type"]]
+        own, rest = rest[:width], rest[width:]
+        turn = Rotation.from_quat(own, scalar_first=True) if width == 4 else Rotation.from_rotvec([0, 0, sum(own)])
+        parent = joint["Parent"]
+        offset = [joint["AttachX"], joint["AttachY"], joint["AttachZ"]]
+        if parent >= 0:
+            places.append(places[parent] + turns[parent].apply(offset))
+            turn = turns[parent] * turn
+        turns.append(turn)
+    return {joint["Name"]: axes @ place for joint, place in zip(joints, places, strict=True)}
