@@ -57,6 +57,7 @@ class Holdout(CharacterEnv):
         appendix D, https://arxiv.org/abs/1905.09808
 
     Example:
+        >>> import math
         >>> env = Holdout(num_envs=2, directions=(0.0, 1.5 * math.pi), seed=0)
         >>> env.rollout(3)["next", "observation"].shape
         torch.Size([2, 3, 27])

@@ -20,13 +20,13 @@ TRAILING_KEYS = (12.0, 42.0, 0.0)
 """Least flexion of the other knee at these phases, in degrees."""
 
 STANDING_KNEE = 6.0
-LEAST_KNEE = 3.5
+LEAST_KNEE = 5.0
 """Flexions in degrees: of a character that stands, and the least for which the pelvis comes down to keep it."""
 
 SOFTNESS = 0.002
 """In metres, of the choice of the lower of two heights."""
 
-RELIEF = 0.12
+RELIEF = 0.16
 """Half the time in seconds over which the pelvis gives way to a leg that would be stretched."""
 
 OUTWARD = 0.7
