@@ -57,7 +57,7 @@ def walk(character: str, speed: Tensor, turn_rate: Tensor, *, fps: float = FPS) 
     Example:
         >>> import torch
         >>> clip = walk("biped", torch.full((121,), 1.0), torch.zeros(121))
-        >>> clip.duration, float(clip.qpos[-1, 0] - clip.qpos[0, 0])
+        >>> clip.duration, round(float(clip.qpos[-1, 0] - clip.qpos[0, 0]), 1)
         (2.0, 2.0)
     """
     _check(character, speed, turn_rate, fps)

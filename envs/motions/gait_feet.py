@@ -73,6 +73,11 @@ def step(course: Course, side: Side, sole: Sole) -> Foot:
 
     Every part of its motion shrinks with the distance to the next foothold, so that a foot whose next foothold is the
     last one stays where it is: standing still is walking on the spot.
+
+    Args:
+        course: Of the walk, F frames.
+        side: Of the foot.
+        sole: Of the foot.
     """
     phase = _warped((course.phase - side.offset - MID_STANCE) % 1 + MID_STANCE, course.speed)
     last, following = course.moment(side, FOOTHOLD), course.moment(side, 1 + FOOTHOLD)

@@ -4,6 +4,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+import scipy.optimize
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -84,11 +85,23 @@ def test_the_torso_takes_the_box_by_touching_it(gap, taken):
 def test_every_character_can_take_the_box_by_walking_up_to_it(character):
     env = make(1, character, terminate_on_fall=False)
     env.reset()
-    state, data = env.get_state(), env.simulation.data(0)
-    carrier = data.body(env.character.carrier)
-    place = torch.from_numpy(carrier.xipos.copy())
-    assert state["qpos"][0, -5].item() == pytest.approx(carrier.xipos[2])
-    state["qpos"][:, -7:-5] = state["mocap_pos"][:, 1, :2] = place[:2] + torch.tensor([0.0, -0.15])
+    state, model = env.get_state(), env.simulation.model
+    carrier = model.body(env.character.carrier)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert state["qpos"][0, -5].item() == pytest.approx(data.body(carrier.id).xipos[2])
+
+    def gap(distance):
+        """From the nearest of the carrier's shapes to a box that far ahead."""
+        data.joint("box").qpos[:2], data.joint("box").qpos[3:] = (distance, 0.0), (1.0, 0.0, 0.0, 0.0)
+        mujoco.mj_kinematics(model, data)
+        shapes = carrier.geomadr[0] + np.flatnonzero(model.geom_conaffinity[model.geom_bodyid == carrier.id])
+        return min(mujoco.mj_geomDistance(model, data, shape, model.geom("box").id, 5.0, None) for shape in shapes)
+
+    inside = data.body(carrier.id).xipos[0] + HALF_SIZE
+    distance = scipy.optimize.brentq(lambda distance: gap(distance) + 0.002, inside, inside + 2.0)
+    state["qpos"][:, -7:-5] = state["mocap_pos"][:, 1, :2] = torch.tensor([distance, 0.0])
+    state["qpos"][:, -4:] = state["mocap_quat"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     state["mocap_pos"][:, 0, :2] = torch.tensor([-5.0, 0.0])
     play(env, env.reset(state, set_state=True), 1)
     assert joined(env) == [1.0]
