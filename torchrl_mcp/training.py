@@ -127,8 +127,8 @@ class Trainer:
                 metrics = self._episode_metrics(batch) | self._gate_metrics(batch)
                 with self.stopwatch("update"):
                     with self._precision():
-                        self.advantages(batch)
-                    metrics |= self._update(batch)
+                        samples = self.advantages(batch)
+                    metrics |= self._update(samples)
                 self._update_normalisers(batch)
                 self.frozen.verify()
                 self._advance(metrics, time.perf_counter() - start)
@@ -169,10 +169,10 @@ class Trainer:
         GlobalRNGState().load_state_dict(random)
         return collector
 
-    def _update(self, batch: TensorDictBase) -> dict[str, float]:
-        """Take ``num_epochs`` passes of gradient steps over the batch; give the mean of everything the loss reports."""
+    def _update(self, samples: TensorDictBase) -> dict[str, float]:
+        """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports."""
         keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
-        samples = batch.select(*keys, "advantage", "value_target", "state_value").flatten()
+        samples = samples.select(*keys, *self.advantages.out_keys).flatten()
         reports: list[TensorDictBase] = []
         for _ in range(self.num_epochs):
             order = torch.randperm(samples.shape[0], device=samples.device)

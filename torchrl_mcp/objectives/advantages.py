@@ -26,6 +26,8 @@ class Advantages:
         Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage Estimation*, 2016.
     """
 
+    out_keys = ("advantage", "value_target", "state_value")
+
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
         self.critic = critic
         self.reward_scale = 1 - gamma
