@@ -3,7 +3,7 @@
     python benchmarks/heading.py                      # trains what is missing: an hour or two per character on a core
     python benchmarks/heading.py --report             # trains nothing
 
-Every character learns with ``method=scratch task=heading preset=fast`` for as many steps as ``CHARACTERS`` says. Run
+Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for as many steps as ``CHARACTERS`` says. Run
 folders are in ``--output``; a run that was stopped goes on. The report plays one episode of 20 s in each of
 ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
 film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
@@ -52,7 +52,7 @@ def main() -> None:
 
 def train(run: Path, character: str) -> None:
     """Train a character in a process of its own, or go on where a former one stopped."""
-    settings = [f"character={character}", f"training.total_frames={CHARACTERS[character]}", "progress_bar=false"]
+    settings = [f"character={character}", "character.action_std=0.15", f"training.total_frames={CHARACTERS[character]}", "progress_bar=false"]
     begun = (run / experiment.CONFIG).exists()
     arguments = [f"resume={run}"] if begun else [*COMMON, *settings, f"run_dir={run}"]
     command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]

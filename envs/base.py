@@ -264,6 +264,11 @@ class CharacterEnv(EnvBase):
             faults: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
         """
 
+    @property
+    def measure_names(self) -> dict[str, list[str]]:
+        """What is observed for the record, beside ``observation`` and ``goal``: the names of the entries of each key."""
+        return {key: [key] for key in self._observed if key not in ("observation", "goal")}
+
     def _arrows(self, index: int) -> list[Arrow]:
         """What to draw beside the simulation."""
         return []

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import joint_layout
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.motions.library import MotionLibrary, MotionState
@@ -16,10 +17,13 @@ from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
-from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_reward
+from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_rewards
 
 NUM_TARGETS = 2
 """States of the reference that the goal shows ahead (section 4)."""
+
+MEMORY = 0.9997
+"""Share of the counts of steps and failures that remains after a control step: they reach back about 100 s."""
 
 
 class Imitation(PDCharacterEnv):
@@ -29,24 +33,34 @@ class Imitation(PDCharacterEnv):
     :math:`\Delta t /` ``switch_interval`` per step the reference becomes another random moment, brought to where the
     character is and faces. ``goal`` (2 x 13 L) holds, for the next two steps, the positions of the L bodies of the
     reference relative to the ground below the character, their orientations and velocities, in its heading frame.
-    ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in metres.
+    ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in metres, and
+    ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
 
-    The reward is :func:`~torchrl_mcp.envs.tracking.tracking_reward` of these errors: ``pose``, the mean squared angle
-    of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and ``root_velocity``, the
-    squared distance plus a tenth of the squared angle of the root; ``key_positions``, the mean squared distance of the
-    character's key bodies relative to the root; ``com``, the squared distance of the centre of mass.
+    The reward is the sum of :func:`~torchrl_mcp.envs.tracking.tracking_rewards` of these errors: ``pose``, the mean
+    squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
+    ``root_velocity``, the squared distance plus a tenth of the squared angle of the root; ``key_positions``, the mean
+    squared distance of the character's key bodies relative to the root; ``bodies``, the mean squared distance of all
+    bodies in the world; ``com``, the squared distance of the centre of mass.
 
     An episode ends, without reward and without value beyond, when the character falls or its bodies are on average
     further than ``max_error`` from the reference. The end of a clip that does not loop truncates it, as the time limit
     does, and the value of what would follow counts.
 
+    With ``failure_weighting`` :math:`\alpha`, references are drawn more often the more often they are lost:
+
+    .. math:: P(c) \propto W_c \left(1 - \alpha + \alpha \, \lambda_c / \bar{\lambda}\right)
+
+    where :math:`W_c` is the weight of clip :math:`c` in the library, :math:`\lambda_c` the recent share of its steps
+    that ended an episode, and :math:`\bar{\lambda}` the mean of these over clips by weight.
+
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
-        library: Reference motions of that character.
+        clips: Reference motions of that character: a library, or clips by name.
         num_envs: Number N of simulations.
         terms: Weight and scale of each error in the reward, by name.
         max_error: Largest mean distance of bodies from the reference, in metres.
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        failure_weighting: :math:`\alpha`, from 0 to 1.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -61,23 +75,29 @@ class Imitation(PDCharacterEnv):
     def __init__(
         self,
         character: str,
-        library: MotionLibrary,
+        clips: MotionLibrary | Mapping[str, MotionClip],
         num_envs: int,
         *,
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
+        failure_weighting: float = 0.0,
         max_episode_steps: int = 300,
         **kwargs: Any,
     ) -> None:
+        library = clips if isinstance(clips, MotionLibrary) else MotionLibrary(clips)
         if library.character != character:
-            raise ValueError(f"library holds motions of {library.character}: pass motions of character={character!r}")
+            raise ValueError(f"clips are of {library.character}: pass motions of character={character!r}")
         not_negative(max_error=max_error)
+        if not 0 <= failure_weighting <= 1:
+            raise ValueError(f"failure_weighting={failure_weighting} is out of range: pass 0 (none) to 1")
         if not switch_interval > 0:
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
         self.library, self.max_error = library, max_error
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
+        self.failure_weighting = failure_weighting
+        self._steps = self._failures = torch.ones(len(library), dtype=torch.float64)
         self._layout, names = joint_layout(character), library.body_names
         self._keys = [names.index(body) for body in CHARACTERS[character].key_bodies]
         reference = {
@@ -86,6 +106,7 @@ class Imitation(PDCharacterEnv):
             "turn": torch.zeros((), dtype=torch.float64),
             "shift": torch.zeros(2, dtype=torch.float64),
             "error": torch.zeros((), dtype=torch.float64),
+            "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
         super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
         if unknown := self.terms.keys() - self._errors(self._reference(0)).keys():
@@ -101,20 +122,57 @@ class Imitation(PDCharacterEnv):
         clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
         return self.library.at(clip, time + steps * CONTROL_TIMESTEP).placed(Placement(turn, shift))
 
-    def _sample(self, num: int) -> dict[str, Tensor]:
-        clips, times = self.library.sample(num, self.generator)
-        moment = self.library.at(clips, times)
-        shift = -moment.qpos[:, :2]
-        placed = moment.placed(Placement(torch.zeros(num, dtype=torch.float64), shift))
+    @property
+    def measure_names(self) -> dict[str, list[str]]:
+        """See :attr:`CharacterEnv.measure_names`."""
+        return {**super().measure_names, "reward_terms": [f"reward_{name}" for name in self.terms]}
+
+    def beginning(self, clips: Tensor, times: Tensor) -> dict[str, Tensor]:
+        """States for ``reset(set_state=True)`` that begin episodes at moments of clips, each ``(n, ...)``.
+
+        Args:
+            clips: Index of each clip in ``library``, shape ``(n,)``, int64.
+            times: Seconds since its first frame, shape ``(n,)``, float64.
+        """
+        num, moment = len(clips), self.library.at(clips, times)
+        turn, shift = torch.zeros(num, dtype=torch.float64), -moment.qpos[:, :2]
+        placed = moment.placed(Placement(turn, shift))
         return {
             "qpos": placed.qpos,
             "qvel": placed.qvel,
             "clip": clips,
             "time": times,
-            "turn": torch.zeros(num, dtype=torch.float64),
+            "turn": turn,
             "shift": shift,
             "error": torch.zeros(num, dtype=torch.float64),
+            "terms": torch.zeros(num, len(self.terms), dtype=torch.float64),
         }
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """See :meth:`CharacterEnv.get_extra_state`; and how often each clip was followed and lost."""
+        return {**super().get_extra_state(), "steps": self._steps, "failures": self._failures}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        super().set_extra_state(state)
+        self._steps, self._failures = state["steps"].clone(), state["failures"].clone()
+
+    def _sample(self, num: int) -> dict[str, Tensor]:
+        return self.beginning(*self._draw(num))
+
+    def _draw(self, num: int) -> tuple[Tensor, Tensor]:
+        """Draw moments of clips, the difficult ones more often."""
+        weights, share = self.library.weights, self.failure_weighting
+        if share:
+            rate = self._failures / self._steps
+            weights = weights * (1 - share + share * rate * weights.sum() / (weights @ rate))
+        return self.library.sample(num, self.generator, weights)
+
+    def _remember(self, ended: Tensor) -> None:
+        """Count steps and failures of each clip, and let old ones fade."""
+        clips = self.episode["clip"]
+        steps, failures = (torch.bincount(chosen, minlength=len(self.library)) for chosen in (clips, clips[ended]))
+        self._steps, self._failures = MEMORY * self._steps + steps, MEMORY * self._failures + failures
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         angle, origin = self.heading(ids), self._positions[ids, 0] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
@@ -124,6 +182,7 @@ class Imitation(PDCharacterEnv):
             "observation": self._state(ids, angle),
             "goal": torch.cat(goal, -1),
             "tracking_error": self.episode["error"][ids].unsqueeze(-1),
+            "reward_terms": self.episode["terms"][ids],
         }
 
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,9 +190,13 @@ class Imitation(PDCharacterEnv):
         reference = self._reference(0)
         error = torch.linalg.vector_norm(self._positions - reference.bodies.positions, dim=-1).mean(-1)
         lost = self.episode["error"].copy_(error) > self.max_error
-        reward, fallen = self._unless_fallen(tracking_reward(self._errors(reference), self.terms))
+        rewards = tracking_rewards(self._errors(reference), self.terms)
+        reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
+        ended = fallen | lost
+        if self.failure_weighting:
+            self._remember(ended)
         self._switch()
-        return reward.masked_fill(lost, 0.0), fallen | lost
+        return reward.masked_fill(lost, 0.0), ended
 
     def _switch(self) -> None:
         """Give some characters another reference, beginning where they are and facing as they do."""
@@ -141,7 +204,7 @@ class Imitation(PDCharacterEnv):
         ids = (chance < self.switch_probability).nonzero().squeeze(-1)
         if not len(ids):
             return
-        clips, times = self.library.sample(len(ids), self.generator)
+        clips, times = self._draw(len(ids))
         placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][ids])
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
         for key, value in changed.items():
@@ -161,6 +224,7 @@ class Imitation(PDCharacterEnv):
             "root_pose": squared_distances(qpos[:, :3], reference.qpos[:, :3]) + 0.1 * angles[:, 0],
             "root_velocity": moves[:, :3].sum(-1) + 0.1 * moves[:, 3:6].sum(-1),
             "key_positions": squared_distances(at, target - target[:, :1])[:, keys].mean(-1),
+            "bodies": squared_distances(self._positions, target).mean(-1),
             "com": squared_distances(self._com, self._centre_of_mass(reference.bodies)),
         }
 

@@ -14,23 +14,23 @@ class Term(NamedTuple):
     scale: float
 
 
-def tracking_reward(errors: Mapping[str, Tensor], terms: Mapping[str, Term]) -> Tensor:
-    r"""Reward of motion imitation: how close the character is to the reference in several respects.
+def tracking_rewards(errors: Mapping[str, Tensor], terms: Mapping[str, Term]) -> Tensor:
+    r"""Terms of the reward of motion imitation: how close the character is to the reference in several respects.
 
-    .. math:: r = \sum_i w_i \exp(-c_i e_i)
+    .. math:: r = \sum_i r_i, \quad r_i = w_i \exp(-c_i e_i)
 
     Args:
         errors: Errors :math:`e_i` by name, each of shape ``(*B)``.
         terms: Weights :math:`w_i` and scales :math:`c_i` by the names of errors.
 
     Returns:
-        Reward, shape ``(*B)``.
+        Terms :math:`r_i` in the order of ``terms``, shape ``(*B, I)``.
 
     Reference:
         Peng et al., *DeepMimic: Example-Guided Deep Reinforcement Learning of Physics-Based Character Skills*, 2018,
         section 5.2.
     """
-    return torch.stack([term.weight * (-term.scale * errors[name]).exp() for name, term in terms.items()]).sum(0)
+    return torch.stack([term.weight * (-term.scale * errors[name]).exp() for name, term in terms.items()], -1)
 
 
 def squared_angles(one: Tensor, other: Tensor) -> Tensor:

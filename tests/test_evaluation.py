@@ -1,4 +1,5 @@
 import math
+from typing import ClassVar
 
 import pytest
 import torch
@@ -147,24 +148,28 @@ def episodes(returns, lengths=None, terminated=None):
 
 
 class Measured(Countdown):
-    """Raises a flag in the second step of every episode, and counts the steps."""
+    """Raises a flag in the second step of every episode, and counts the steps up and down."""
+
+    measure_names: ClassVar = {"success": ["success"], "steps": ["up", "down"]}
 
     def __init__(self, lengths):
         super().__init__(lengths)
         one = (*self.batch_size, 1)
         self.observation_spec["success"] = Binary(1, shape=one, dtype=torch.bool)
-        self.observation_spec["steps"] = Unbounded(one)
+        self.observation_spec["steps"] = Unbounded((*self.batch_size, 2))
 
     def _emit(self, done, **kwargs):
         elapsed = self.elapsed.unsqueeze(-1)
-        return super()._emit(done, success=elapsed == 2, steps=elapsed.float(), **kwargs)
+        steps = torch.cat([elapsed, -elapsed], -1).float()
+        return super()._emit(done, success=elapsed == 2, steps=steps, **kwargs)
 
 
 def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
     outcome = evaluate(IDLE, Measured([1, 2, 5]))
     assert outcome.measures["success"].tolist() == [False, True, True]
-    assert outcome.measures["steps"].tolist() == [1.0, 1.5, 3.0]
-    assert summary(outcome, lambda returns: returns)["measures"] == pytest.approx({"success": 2 / 3, "steps": 5.5 / 3})
+    assert outcome.measures["up"].tolist() == [1.0, 1.5, 3.0]
+    expected = {"success": 2 / 3, "up": 5.5 / 3, "down": -5.5 / 3}
+    assert summary(outcome, lambda returns: returns)["measures"] == pytest.approx(expected)
 
 
 def test_a_summary_of_four_episodes_by_hand():

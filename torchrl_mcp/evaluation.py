@@ -30,11 +30,6 @@ class Evaluation:
     measures: dict[str, Tensor] = field(default_factory=dict)
 
 
-def measured(env: EnvBase) -> list[str]:
-    """Names of what a task observes for the record, beside ``observation`` and ``goal``."""
-    return [key for key in env.observation_spec.keys() if key not in ("observation", "goal")]  # noqa: SIM118
-
-
 @torch.no_grad()
 def evaluate(
     policy: TensorDictModuleBase,
@@ -50,7 +45,7 @@ def evaluate(
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``.
-        env: Environments with batch size ``[N]`` whose episodes all end.
+        env: Environments with batch size ``[N]`` whose episodes all end; what ``env.measure_names`` lists is measured.
         deterministic: Play the deterministic action rather than a sample.
         start: State to begin from, as of ``env.get_state()``, or None to draw it.
         device: Where the policy is.
@@ -64,9 +59,10 @@ def evaluate(
     positions: list[Tensor] = []
     flags: dict[str, Tensor] = {}
     sums: dict[str, Tensor] = {}
-    for key in measured(env):
-        measures = flags if env.observation_spec[key].dtype is torch.bool else sums
-        measures[key] = torch.zeros(env.batch_size, dtype=env.observation_spec[key].dtype)
+    names = getattr(env, "measure_names", {})
+    for key in names:
+        kind = flags if env.observation_spec[key].dtype is torch.bool else sums
+        kind[key] = torch.zeros_like(state[key])
     with set_exploration_type(exploration):
         while running.any():
             action = policy(state.select("observation", "goal").to(device))["action"]
@@ -76,13 +72,18 @@ def evaluate(
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
             for key, raised in flags.items():
-                raised |= running & outcome[key].squeeze(-1)
+                raised |= running.unsqueeze(-1) & outcome[key]
             for key, total in sums.items():
-                total += outcome[key].squeeze(-1) * running
+                total += outcome[key] * running.unsqueeze(-1)
             running &= ~outcome["done"].squeeze(-1)
             positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
-    means = {key: total / lengths for key, total in sums.items()}
-    return Evaluation(returns, lengths, terminated, torch.stack(positions), flags | means)
+    means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
+    measures = {
+        name: value
+        for key, values in (flags | means).items()
+        for name, value in zip(names[key], values.unbind(-1), strict=True)
+    }
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), measures)
 
 
 def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:

@@ -20,7 +20,6 @@ from torchrl_mcp.actors import Actor
 from torchrl_mcp.checkpoint import load, run_checkpoint
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.episodes import EpisodeStatistics
-from torchrl_mcp.evaluation import measured
 from torchrl_mcp.modules import RunningNormaliser, gate_diagnostics
 from torchrl_mcp.objectives import Advantages
 from torchrl_mcp.progress import SECTIONS, Progress, Stopwatch
@@ -226,8 +225,16 @@ class Trainer:
             "episode/length": lengths.mean().item(),
             "episode/faults": self.env.num_faults,
             "reward": batch["next", "reward"].mean().item(),
-            **{f"task/{key}": batch["next", key].float().mean().item() for key in measured(self.env)},
+            **self._task_metrics(batch),
         }
+
+    def _task_metrics(self, batch: TensorDictBase) -> dict[str, float]:
+        """Mean of all that the task observes for the record."""
+        metrics: dict[str, float] = {}
+        for key, names in self.env.measure_names.items():
+            means = batch["next", key].float().flatten(0, -2).mean(0)
+            metrics |= {f"task/{name}": mean for name, mean in zip(names, means.tolist(), strict=True)}
+        return metrics
 
     def _gate_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         if "gates" not in self.actor.stored:

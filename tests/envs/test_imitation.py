@@ -106,6 +106,9 @@ def test_a_shifted_character_has_the_errors_of_the_shift():
     errors = {name: error.item() for name, error in env._errors(env._reference(0)).items()}
     assert errors["pose"] == pytest.approx(0.2**2 / 7)  # of seven joints
     assert errors["root_pose"] == pytest.approx(0.1**2)
+    others = [body for body in env.library.body_names if body not in ("right_knee", "right_ankle")]
+    assert errors["bodies"] >= 0.1**2 * len(others) / 8
+    assert errors["bodies"] == pytest.approx(0.1**2, abs=0.005)
     assert errors["root_velocity"] == pytest.approx(0.5**2)
     assert errors["velocity"] == pytest.approx(0)
     assert errors["com"] == pytest.approx(0.1**2, abs=0.002)  # the shank has moved a little, too
@@ -156,6 +159,40 @@ def test_a_new_reference_begins_where_the_character_is_and_faces():
     assert not during["terminated"].any()
 
 
+def test_lost_references_come_back_more_often():
+    clips = {"still": gliding("biped", loop=True), "shifted": gliding("biped", turn=TURN, loop=True)}
+    env = make(num_envs=1000, clips=clips, failure_weighting=0.8)
+    env.reset()
+    assert (env.get_state()["clip"] == 0).float().mean().item() == pytest.approx(0.5, abs=0.08)
+    # The second has failed three times as often as the first: rates 1 : 3, mean 2, weights 0.2 + 0.8 x (0.5, 1.5).
+    env._steps, env._failures = torch.tensor([100.0, 300.0]).double(), torch.tensor([10.0, 90.0]).double()
+    env.reset()
+    assert (env.get_state()["clip"] == 0).float().mean().item() == pytest.approx(0.6 / 2.0, abs=0.07)
+
+
+def test_failures_are_counted_by_clip_and_survive_a_checkpoint():
+    clips = {"still": gliding("biped", loop=True), "other": gliding("biped", turn=TURN, loop=True)}
+    env, copy = (make(num_envs=4, clips=clips, failure_weighting=1.0, max_error=0.3) for _ in range(2))
+    env.reset()
+    state = env.get_state()
+    state["clip"] = torch.tensor([0, 1, 1, 1])
+    state["qpos"][1:3, 1] += 1.0  # two of the second clip are lost
+    idle(env, env.reset(state, set_state=True))
+    steps, failures = env._steps, env._failures
+    torch.testing.assert_close(steps, torch.tensor([2.0, 4.0]).double(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(failures, torch.tensor([1.0, 3.0]).double(), atol=1e-3, rtol=0)
+    copy.load_state_dict(env.state_dict())
+    assert torch.equal(copy._failures, failures)
+    assert torch.equal(copy._steps, steps)
+
+
+def test_the_terms_of_the_reward_are_told():
+    env = make(num_envs=2)
+    outcome = idle(env, env.reset())
+    assert env.measure_names["reward_terms"] == ["reward_pose", "reward_root_pose"]
+    torch.testing.assert_close(outcome["reward_terms"].sum(-1, keepdim=True), outcome["reward"])
+
+
 def test_the_same_state_continues_alike():
     env = make(num_envs=8, switch_interval=0.3)
     env.reset()
@@ -168,12 +205,14 @@ def test_the_same_state_continues_alike():
 
 
 def test_motions_and_terms_are_checked():
-    with pytest.raises(ValueError, match="library holds motions of humanoid"):
+    with pytest.raises(ValueError, match="clips are of humanoid"):
         make("biped", clips={"glide": gliding("humanoid")})
     with pytest.raises(ValueError, match=r"terms name \['posture'\]"):
         make(terms={"posture": {"weight": 1.0, "scale": 1.0}})
     with pytest.raises(ValueError, match="switch_interval=0"):
         make(switch_interval=0)
+    with pytest.raises(ValueError, match=r"failure_weighting=1\.5"):
+        make(failure_weighting=1.5)
 
 
 def test_the_best_possible_return_is_one():

@@ -5,13 +5,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_reward
+from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_rewards
 
 
-def test_the_reward_is_the_weighted_sum_of_exponentials():
+def test_the_terms_of_the_reward_are_weighted_exponentials():
     errors = {"pose": torch.tensor([0.0, 0.5]), "com": torch.tensor([0.0, 0.1]), "unused": torch.tensor([9.0, 9.0])}
-    reward = tracking_reward(errors, {"pose": Term(0.7, 2.0), "com": Term(0.3, 10.0)})
-    torch.testing.assert_close(reward, torch.tensor([1.0, 0.7 * math.exp(-1) + 0.3 * math.exp(-1)]))
+    rewards = tracking_rewards(errors, {"pose": Term(0.7, 2.0), "com": Term(0.3, 10.0)})
+    torch.testing.assert_close(rewards, torch.tensor([[0.7, 0.3], [0.7 * math.exp(-1), 0.3 * math.exp(-1)]]))
 
 
 @pytest.mark.parametrize("seed", range(5))
