@@ -266,7 +266,7 @@ class CharacterEnv(EnvBase):
 
     @property
     def measure_names(self) -> dict[str, list[str]]:
-        """What is observed for the record, beside ``observation`` and ``goal``: the names of the entries of each key."""
+        """What is observed for the record, not for the policy: the names of the entries of each key."""
         return {key: [key] for key in self._observed if key not in ("observation", "goal")}
 
     def _arrows(self, index: int) -> list[Arrow]:

@@ -22,6 +22,18 @@ from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, t
 NUM_TARGETS = 2
 """States of the reference that the goal shows ahead (section 4)."""
 
+ERRORS = (
+    "pose",
+    "velocity",
+    "root_pose",
+    "root_velocity",
+    "key_positions",
+    "bodies",
+    "orientations",
+    "com",
+)
+"""Respects in which a character differs from its reference, of which the terms of the reward are made."""
+
 MEMORY = 0.9997
 """Share of the counts of steps and failures that remains after a control step: they reach back about 100 s."""
 
@@ -40,7 +52,8 @@ class Imitation(PDCharacterEnv):
     squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
     ``root_velocity``, the squared distance plus a tenth of the squared angle of the root; ``key_positions``, the mean
     squared distance of the character's key bodies relative to the root; ``bodies``, the mean squared distance of all
-    bodies in the world; ``com``, the squared distance of the centre of mass.
+    bodies in the world; ``orientations``, the mean squared angle of all bodies in the world; ``com``, the squared
+    distance of the centre of mass.
 
     An episode ends, without reward and without value beyond, when the character falls or its bodies are on average
     further than ``max_error`` from the reference. The end of a clip that does not loop truncates it, as the time limit
@@ -109,8 +122,8 @@ class Imitation(PDCharacterEnv):
             "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
         super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
-        if unknown := self.terms.keys() - self._errors(self._reference(0)).keys():
-            raise ValueError(f"terms name {sorted(unknown)}, which are no errors: see the documentation of Imitation")
+        for name in self.terms:
+            self._error(name, self._reference(0))
         self._make_specs()
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
@@ -190,7 +203,7 @@ class Imitation(PDCharacterEnv):
         reference = self._reference(0)
         error = torch.linalg.vector_norm(self._positions - reference.bodies.positions, dim=-1).mean(-1)
         lost = self.episode["error"].copy_(error) > self.max_error
-        rewards = tracking_rewards(self._errors(reference), self.terms)
+        rewards = tracking_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
         reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
         ended = fallen | lost
         if self.failure_weighting:
@@ -210,23 +223,34 @@ class Imitation(PDCharacterEnv):
         for key, value in changed.items():
             self.episode[key][ids] = value
 
-    def _errors(self, reference: MotionState) -> dict[str, Tensor]:
-        """How far the character is from the reference in each respect, ``(N,)`` each."""
-        qpos, qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
-        layout, keys = self._layout, self._keys
-        angles = squared_angles(qpos[:, layout.quaternions], reference.qpos[:, layout.quaternions])
-        hinges = (qpos[:, layout.angles] - reference.qpos[:, layout.angles]).square()
-        at, target = self._positions - self._positions[:, :1], reference.bodies.positions
-        moves = (qvel - reference.qvel).square()
-        return {
-            "pose": torch.cat([angles[:, 1:], hinges], -1).mean(-1),
-            "velocity": moves[:, 6:].sum(-1) / (len(layout.names) - 1),
-            "root_pose": squared_distances(qpos[:, :3], reference.qpos[:, :3]) + 0.1 * angles[:, 0],
-            "root_velocity": moves[:, :3].sum(-1) + 0.1 * moves[:, 3:6].sum(-1),
-            "key_positions": squared_distances(at, target - target[:, :1])[:, keys].mean(-1),
-            "bodies": squared_distances(self._positions, target).mean(-1),
-            "com": squared_distances(self._com, self._centre_of_mass(reference.bodies)),
-        }
+    def _error(self, name: str, reference: MotionState) -> Tensor:
+        """How far the character is from the reference in one respect, one of ``ERRORS``, ``(N,)``."""
+        qpos, qvel, layout = self.simulation.state["qpos"], self.simulation.state["qvel"], self._layout
+        positions, targets = self._positions, reference.bodies.positions
+        match name:
+            case "pose":
+                turns = squared_angles(qpos[:, layout.quaternions[1:]], reference.qpos[:, layout.quaternions[1:]])
+                hinges = (qpos[:, layout.angles] - reference.qpos[:, layout.angles]).square()
+                return torch.cat([turns, hinges], -1).mean(-1)
+            case "velocity":
+                return squared_distances(qvel[:, 6:], reference.qvel[:, 6:]) / (len(layout.names) - 1)
+            case "root_pose":
+                turn = squared_angles(qpos[:, 3:7], reference.qpos[:, 3:7])
+                return squared_distances(qpos[:, :3], reference.qpos[:, :3]) + 0.1 * turn
+            case "root_velocity":
+                linear, angular = (qvel - reference.qvel)[:, :6].square().split(3, -1)
+                return linear.sum(-1) + 0.1 * angular.sum(-1)
+            case "key_positions":
+                own, other = (at[:, self._keys] - at[:, :1] for at in (positions, targets))
+                return squared_distances(own, other).mean(-1)
+            case "bodies":
+                return squared_distances(positions, targets).mean(-1)
+            case "orientations":
+                return squared_angles(self._orientations, reference.bodies.orientations).mean(-1)
+            case "com":
+                return squared_distances(self._com, self._centre_of_mass(reference.bodies))
+            case _:
+                raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
 
     def _centre_of_mass(self, bodies: BodyStates) -> Tensor:
         """Of the character, if its bodies were there, ``(N, 3)``."""
