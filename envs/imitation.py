@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
-from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import joint_layout
-from torchrl_mcp.envs.motions.kinematics import BodyStates
-from torchrl_mcp.envs.motions.library import MotionLibrary, MotionState
+from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
@@ -122,18 +120,13 @@ class Imitation(PDCharacterEnv):
             "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
         super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
-        for name in self.terms:
-            self._error(name, self._reference(0))
         self._make_specs()
+        for name in self.terms:
+            self._error(name, self._next)
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`R / (T \sum_i w_i)`."""
         return episode_return / (self.max_episode_steps * sum(term.weight for term in self.terms.values()))
-
-    def _reference(self, steps: int, ids: Tensor | slice = ALL) -> MotionState:
-        """The references of simulations as many steps ahead, in the world."""
-        clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
-        return self.library.at(clip, time + steps * CONTROL_TIMESTEP).placed(Placement(turn, shift))
 
     @property
     def measure_names(self) -> dict[str, list[str]]:
@@ -149,10 +142,9 @@ class Imitation(PDCharacterEnv):
         """
         num, moment = len(clips), self.library.at(clips, times)
         turn, shift = torch.zeros(num, dtype=torch.float64), -moment.qpos[:, :2]
-        placed = moment.placed(Placement(turn, shift))
         return {
-            "qpos": placed.qpos,
-            "qvel": placed.qvel,
+            "qpos": torch.cat([torch.zeros_like(shift), moment.qpos[:, 2:]], -1),
+            "qvel": moment.qvel,
             "clip": clips,
             "time": times,
             "turn": turn,
@@ -188,20 +180,36 @@ class Imitation(PDCharacterEnv):
         self._steps, self._failures = MEMORY * self._steps + steps, MEMORY * self._failures + failures
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        angle, origin = self.heading(ids), self._positions[ids, 0] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-        targets = [self._reference(step, ids).bodies for step in range(1, NUM_TARGETS + 1)]
-        goal = [bodies_in_heading_frame(angle, origin, target) for target in targets]
+        angle, place = self.heading(ids), self._positions[ids, 0]
+        targets = self._look_ahead(ids)
+        # Seen from the character, a reference looks as its clip does from where it would be there.
+        ground = place * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        origin = targets.placement.inverse().points(ground.repeat(NUM_TARGETS, 1))
+        turn = angle.repeat(NUM_TARGETS) - targets.placement.turn
+        dtype = targets.moment.qpos.dtype
+        goal = bodies_in_heading_frame(turn.to(dtype), origin.to(dtype), targets.moment.bodies)
         return {
             "observation": self._state(ids, angle),
-            "goal": torch.cat(goal, -1),
+            "goal": goal.unflatten(0, (NUM_TARGETS, -1)).transpose(0, 1).flatten(1),
             "tracking_error": self.episode["error"][ids].unsqueeze(-1),
             "reward_terms": self.episode["terms"][ids],
         }
 
+    def _look_ahead(self, ids: Tensor | slice) -> PlacedMotion:
+        """The references of n simulations in the next steps, one step after the other, ``(NUM_TARGETS * n, ...)``."""
+        clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
+        num, steps = len(clip), torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
+        times = (time + CONTROL_TIMESTEP * steps.unsqueeze(-1)).flatten()
+        placement = Placement(turn.repeat(NUM_TARGETS), shift.repeat(NUM_TARGETS, 1))
+        targets = self.library.at(clip.repeat(NUM_TARGETS), times, placement)
+        first = targets[:num]
+        self._next = first if isinstance(ids, slice) else self._next.replaced(ids, first)
+        return targets
+
     def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         self.episode["time"] += CONTROL_TIMESTEP
-        reference = self._reference(0)
-        error = torch.linalg.vector_norm(self._positions - reference.bodies.positions, dim=-1).mean(-1)
+        reference = self._next
+        error = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1).mean(-1)
         lost = self.episode["error"].copy_(error) > self.max_error
         rewards = tracking_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
         reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
@@ -223,10 +231,10 @@ class Imitation(PDCharacterEnv):
         for key, value in changed.items():
             self.episode[key][ids] = value
 
-    def _error(self, name: str, reference: MotionState) -> Tensor:
+    def _error(self, name: str, reference: PlacedMotion) -> Tensor:
         """How far the character is from the reference in one respect, one of ``ERRORS``, ``(N,)``."""
         qpos, qvel, layout = self.simulation.state["qpos"], self.simulation.state["qvel"], self._layout
-        positions, targets = self._positions, reference.bodies.positions
+        positions, targets = self._positions, reference.positions
         match name:
             case "pose":
                 turns = squared_angles(qpos[:, layout.quaternions[1:]], reference.qpos[:, layout.quaternions[1:]])
@@ -246,17 +254,17 @@ class Imitation(PDCharacterEnv):
             case "bodies":
                 return squared_distances(positions, targets).mean(-1)
             case "orientations":
-                return squared_angles(self._orientations, reference.bodies.orientations).mean(-1)
+                return squared_angles(self._orientations, reference.orientations).mean(-1)
             case "com":
-                return squared_distances(self._com, self._centre_of_mass(reference.bodies))
+                return squared_distances(self._com, self._centre_of_mass(reference))
             case _:
                 raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
 
-    def _centre_of_mass(self, bodies: BodyStates) -> Tensor:
+    def _centre_of_mass(self, reference: PlacedMotion) -> Tensor:
         """Of the character, if its bodies were there, ``(N, 3)``."""
-        model, count = self.simulation.model, bodies.positions.shape[-2]
+        model, count = self.simulation.model, reference.positions.shape[-2]
         masses, centres = (torch.from_numpy(field[1 : 1 + count]) for field in (model.body_mass, model.body_ipos))
-        places = bodies.positions + rotate(bodies.orientations, centres)
+        places = reference.positions + rotate(reference.orientations, centres)
         return masses @ places / masses.sum()
 
     def _exhausted(self) -> Tensor:

@@ -3,9 +3,10 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
-from torchrl_mcp.experiment import evaluate_run
+from torchrl_mcp.experiment import evaluate_clips, evaluate_run
 
 
 def main() -> None:
@@ -14,9 +15,13 @@ def main() -> None:
     parser.add_argument("path", type=Path, help="run folder, of which the newest checkpoint counts, or checkpoint file")
     parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
     parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
+    parser.add_argument(
+        "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
+    )
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
     arguments = parser.parse_args()
     try:
+        clips = evaluate_clips(arguments.path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
         results = evaluate_run(arguments.path, episodes=arguments.episodes, seed=arguments.seed)
     except ValueError as error:
         sys.exit(f"torchrl-mcp-evaluate: {error}")
@@ -29,7 +34,15 @@ def main() -> None:
             f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
             + "".join(f", {name} {value:.3f}" for name, value in numbers["measures"].items())
         )
+    if clips:
+        print(f"  {'clip':28} seconds  completed  tracking error  length")
+    for clip in clips:
+        print(
+            f"  {clip.clip:28} {clip.seconds:7.1f}  {clip.completed:9.0%}  {clip.tracking_error:12.3f} m  "
+            f"{clip.length:6.0f}"
+        )
     if arguments.output:
+        results |= {"clips": [asdict(clip) for clip in clips]} if clips else {}
         arguments.output.write_text(json.dumps(results, indent=2) + "\n")
 
 

@@ -1,5 +1,6 @@
 """From a configuration to objects. Beside the entry points, the only module that knows Hydra."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from torchrl.record.loggers.common import Logger
 
 from torchrl_mcp import checkpoint
 from torchrl_mcp.actors import Actor
+from torchrl_mcp.analysis.imitation import ClipResult, follow_each
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation import evaluate, summary
 from torchrl_mcp.record import Record
@@ -174,6 +176,24 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic")
         results[mode] = summary(outcome, env.normalised_return)
     return results
+
+
+def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
+    """Return how well a run's policy follows each of its reference motions, when it plays deterministic actions.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes per clip.
+        seed: Seed of environments.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+    """
+    _, _, env = restore(path, num_envs=1, seed=seed)
+    if not hasattr(env, "library"):
+        raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
+    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, switch_interval=math.inf)
+    return follow_each(agent.actor.policy, env)
 
 
 def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> Trainer:

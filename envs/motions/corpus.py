@@ -1,5 +1,10 @@
-"""The reference motions that come with the library."""
+"""Libraries of reference motions: those that come with the project, and a folder of clips."""
 
+from pathlib import Path
+
+import torch
+
+from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait_corpus import walking_corpus
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.trex import trex_corpus
@@ -18,5 +23,27 @@ def generated_library(character: str, seed: int) -> MotionLibrary:
         ValueError: If no motions of the character can be generated.
     """
     if character == "trex":
-        return MotionLibrary(dict(zip(TREX_CLIPS, trex_corpus(), strict=True)))
-    return MotionLibrary(walking_corpus(character, seed))
+        return MotionLibrary(dict(zip(TREX_CLIPS, trex_corpus(), strict=True)), dtype=torch.float32)
+    return MotionLibrary(walking_corpus(character, seed), dtype=torch.float32)
+
+
+def folder_library(character: str, path: str | Path) -> MotionLibrary:
+    """Return the clips in a folder, as ``torchrl-mcp-motions import`` writes them, by their names without suffix.
+
+    Args:
+        character: Of whom they must be.
+        path: Folder with ``.npz`` files.
+
+    Raises:
+        ValueError: If there are none, one is damaged, or one is of another character.
+    """
+    files = sorted(Path(path).glob("*.npz"))
+    if not files:
+        raise ValueError(f"path={str(path)!r} holds no clips (.npz): write some with torchrl-mcp-motions import")
+    clips = {file.stem: MotionClip.load(file) for file in files}
+    if others := [name for name, clip in clips.items() if clip.character != character]:
+        raise ValueError(
+            f"path={str(path)!r} holds clips of other characters, such as {others[0]}: import them again with "
+            f"--character {character}"
+        )
+    return MotionLibrary(clips, dtype=torch.float32)

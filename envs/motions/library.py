@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from torchrl_mcp.envs.rotations import continuous
 
 
 class MotionState(NamedTuple):
-    """Moments of reference motions.
+    """Moments of reference motions, where their clips have them.
 
     Args:
         qpos: States of the character, shape ``(N, nq)``.
@@ -27,16 +28,61 @@ class MotionState(NamedTuple):
     qvel: Tensor
     bodies: BodyStates
 
-    def placed(self, placement: Placement) -> "MotionState":
-        """Carry every moment to another place and direction on the ground, N turns and shifts."""
-        each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
-        bodies = BodyStates(
-            positions=each.points(self.bodies.positions),
-            orientations=each.quaternions(self.bodies.orientations),
-            linear_velocities=each.vectors(self.bodies.linear_velocities),
-            angular_velocities=each.vectors(self.bodies.angular_velocities),
-        )
-        return MotionState(placement.qpos(self.qpos), placement.qvel(self.qvel), bodies)
+
+class PlacedMotion:
+    """Moments of reference motions carried to other places and directions, worked out as far as they are asked for.
+
+    Args:
+        moment: N moments.
+        placement: N turns and shifts.
+    """
+
+    def __init__(self, moment: MotionState, placement: Placement) -> None:
+        self.moment, self.placement = moment, placement
+        self._each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
+
+    @cached_property
+    def qpos(self) -> Tensor:
+        """States of the character, shape ``(N, nq)``."""
+        return self.placement.qpos(self.moment.qpos)
+
+    @cached_property
+    def qvel(self) -> Tensor:
+        """Their velocities in MuJoCo's convention, shape ``(N, nv)``."""
+        return self.placement.qvel(self.moment.qvel)
+
+    @cached_property
+    def positions(self) -> Tensor:
+        """Of the bodies, shape ``(N, L, 3)``."""
+        return self._each.points(self.moment.bodies.positions)
+
+    @cached_property
+    def orientations(self) -> Tensor:
+        """Of the bodies, unit quaternions, shape ``(N, L, 4)``."""
+        return self._each.quaternions(self.moment.bodies.orientations)
+
+    @cached_property
+    def bodies(self) -> BodyStates:
+        """All of the bodies, in the world."""
+        velocities = (self.moment.bodies.linear_velocities, self.moment.bodies.angular_velocities)
+        return BodyStates(self.positions, self.orientations, *map(self._each.vectors, velocities))
+
+    def __getitem__(self, index: slice) -> "PlacedMotion":
+        """Some of the moments."""
+        return self._of([part[index] for part in self._parts()])
+
+    def replaced(self, ids: Tensor, others: "PlacedMotion") -> "PlacedMotion":
+        """Return these moments with ``others`` in the rows ``ids``."""
+        pairs = zip(self._parts(), others._parts(), strict=True)
+        return self._of([part.index_copy(0, ids, other) for part, other in pairs])
+
+    def _parts(self) -> list[Tensor]:
+        return [self.moment.qpos, self.moment.qvel, *self.moment.bodies, *self.placement]
+
+    @classmethod
+    def _of(cls, parts: list[Tensor]) -> "PlacedMotion":
+        qpos, qvel, *bodies = parts[:-2]
+        return cls(MotionState(qpos, qvel, BodyStates(*bodies)), Placement(*parts[-2:]))
 
 
 class MotionLibrary:
@@ -89,12 +135,13 @@ class MotionLibrary:
     def __len__(self) -> int:
         return len(self.names)
 
-    def at(self, clips: Tensor, times: Tensor) -> MotionState:
+    def at(self, clips: Tensor, times: Tensor, placement: Placement | None = None) -> PlacedMotion:
         """Read moments of clips.
 
         Args:
             clips: Index of each clip, shape ``(N,)``, int64.
             times: Seconds since its first frame, shape ``(N,)``; held at the ends unless the clip loops.
+            placement: Where to carry each clip, N turns and shifts, or None to leave them where they are.
         """
         last = self._last[clips]
         frames = times.double() * self._fps[clips]
@@ -111,10 +158,11 @@ class MotionLibrary:
         orientations = quaternions[..., self._num_turns :].mT
         positions, linear, angular = (part.unflatten(-1, (3, -1)).mT for part in moments[2:5])
         state = MotionState(qpos, moments[5], BodyStates(positions, orientations, linear, angular))
-        if not cycles.any():
-            return state
-        cycle = Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles)
-        return state.placed(Placement(*(part.to(self._table.dtype) for part in cycle)))
+        if placement is None:
+            placement = Placement(torch.zeros_like(frames), frames.new_zeros(len(clips), 2))
+        if cycles.any():
+            placement = placement.after(Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles))
+        return PlacedMotion(state, placement)
 
     def sample(self, num: int, generator: torch.Generator, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Draw moments: clips by their weights, times evenly over a clip or a cycle of it.

@@ -47,6 +47,12 @@ class Placement(NamedTuple):
         shift = torch.cat([first.shift, torch.zeros_like(first.shift[..., :1])], dim=-1)
         return Placement(self.turn + first.turn, self.points(shift)[..., :2])
 
+    def inverse(self) -> "Placement":
+        """Return the placement that undoes this one."""
+        back = Placement(-self.turn, torch.zeros_like(self.shift))
+        shift = torch.cat([-self.shift, torch.zeros_like(self.shift[..., :1])], dim=-1)
+        return Placement(-self.turn, back.points(shift)[..., :2])
+
     def power(self, times: Tensor) -> "Placement":
         r"""Return the placement done k times over, k an integer of either sign, shape ``(*B)``.
 

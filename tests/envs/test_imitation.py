@@ -13,6 +13,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.imitation import ERRORS
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary
+from torchrl_mcp.envs.motions.placement import Placement
 
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 TERMS = {"pose": {"weight": 0.6, "scale": 3.0}, "root_pose": {"weight": 0.4, "scale": 5.0}}
@@ -41,6 +42,12 @@ def make(character="biped", num_envs=4, clips=None, **kwargs):
     return Imitation(character, library, num_envs, **{**defaults, **kwargs})
 
 
+def reference_of(env):
+    """Where the references are now."""
+    clip, time, turn, shift = (env.episode[key] for key in ("clip", "time", "turn", "shift"))
+    return env.library.at(clip, time, Placement(turn, shift))
+
+
 def idle(env, state):
     return env.step(state.set("action", torch.zeros(env.action_spec.shape, dtype=torch.float64)))["next"]
 
@@ -57,7 +64,7 @@ def test_an_episode_begins_in_a_state_of_the_reference(character):
     state = env.get_state()
     assert state["time"].min() < 0.3
     assert state["time"].max() > 1.7
-    reference = env._reference(0)
+    reference = reference_of(env)
     torch.testing.assert_close(reference.qpos, state["qpos"])
     torch.testing.assert_close(state["qvel"][:, 5], torch.full((64,), TURN, dtype=torch.float64), atol=1e-3, rtol=0)
     torch.testing.assert_close(state["qpos"][:, :2], torch.zeros(64, 2, dtype=torch.float64))
@@ -104,7 +111,7 @@ def test_a_shifted_character_has_the_errors_of_the_shift():
     start = env.simulation.model.joint("right_knee").qposadr[0]
     state["qpos"][:, start] -= 0.2
     env.reset(state, set_state=True)
-    errors = {name: env._error(name, env._reference(0)).item() for name in ERRORS}
+    errors = {name: env._error(name, reference_of(env)).item() for name in ERRORS}
     assert errors["pose"] == pytest.approx(0.2**2 / 7)  # of seven joints
     assert errors["root_pose"] == pytest.approx(0.1**2)
     others = [body for body in env.library.body_names if body not in ("right_knee", "right_ankle")]
@@ -150,7 +157,7 @@ def test_a_new_reference_begins_where_the_character_is_and_faces():
     after = env.get_state()
     switched = (after["time"] - before["time"] - 1 / 30).abs() > 1e-9
     assert switched.float().mean().item() == pytest.approx(1 / 15, abs=4 * math.sqrt(1 / 15 / 256))
-    reference = env._reference(0)
+    reference = reference_of(env)
     torch.testing.assert_close(reference.qpos[switched, :2], after["qpos"][switched, :2])
     facing = [
         Rotation.from_quat(q[switched, 3:7], scalar_first=True).apply([1, 0, 0])[:, :2]

@@ -66,10 +66,20 @@ def test_a_placed_moment_is_placed_with_all_its_bodies(library):
     indices, times = library.sample(16, torch.Generator().manual_seed(1))
     generator = torch.Generator().manual_seed(2)
     turn = torch.randn(16, generator=generator, dtype=torch.float64)
-    moments = library.at(indices, times).placed(Placement(turn, torch.randn(16, 2, generator=generator)))
+    moments = library.at(indices, times, Placement(turn, torch.randn(16, 2, generator=generator)))
     expected = body_states("humanoid", moments.qpos, moments.qvel)
     torch.testing.assert_close(moments.bodies.positions, expected.positions, atol=2e-3, rtol=0)
     torch.testing.assert_close(moments.bodies.linear_velocities, expected.linear_velocities, atol=0.05, rtol=0)
+
+
+def test_rows_of_moments_are_replaced_with_their_places(library):
+    (indices, times), turns = library.sample(6, torch.Generator().manual_seed(1)), torch.arange(6.0).double()
+    placement = Placement(turns, torch.stack([turns, -turns], -1))
+    moments, ids = library.at(indices, times, placement), torch.tensor([4, 1])
+    changed = moments.replaced(ids, moments[:2])
+    order = [0, 1, 2, 3, 0, 5]
+    assert torch.equal(changed.qpos, moments.qpos[order])
+    assert torch.equal(changed.bodies.linear_velocities, moments.bodies.linear_velocities[order])
 
 
 def test_the_digest_changes_with_everything_that_is_read(clips, library):
@@ -116,7 +126,8 @@ def test_the_same_generator_state_draws_the_same_moments(library):
 def test_single_precision_is_emitted_where_asked_for(clips):
     library = MotionLibrary(clips, dtype=torch.float32)
     moments = library.at(torch.tensor([0, 1]), torch.tensor([0.1, 5.0]))
-    assert {field.dtype for field in (moments.qpos, moments.qvel, *moments.bodies)} == {torch.float32}
+    moment = moments.moment
+    assert {field.dtype for field in (moment.qpos, moment.qvel, *moment.bodies)} == {torch.float32}
 
 
 @pytest.mark.parametrize(

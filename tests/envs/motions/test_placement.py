@@ -33,6 +33,12 @@ def test_one_after_another_is_one_placement():
     torch.testing.assert_close(second.after(first).points(point), second.points(first.points(point)))
 
 
+def test_an_inverse_undoes_the_placement():
+    there, point = placement(-2.2, 3.0, -1.0), torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(there.inverse().points(there.points(point)), point)
+    torch.testing.assert_close(there.points(there.inverse().points(point)), point)
+
+
 def test_placing_carries_position_and_heading_but_not_height_or_tilt():
     tilt = about_x(torch.tensor(0.3, dtype=torch.float64))
     yaws = torch.tensor([3.0, -3.0], dtype=torch.float64)
