@@ -3,8 +3,8 @@
     python benchmarks/heading.py                      # trains what is missing: an hour or two per character on a core
     python benchmarks/heading.py --report             # trains nothing
 
-Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for as many steps as ``CHARACTERS`` says. Run
-folders are in ``--output``; a run that was stopped goes on. The report plays one episode of 20 s in each of
+Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for as many steps as
+``CHARACTERS`` says. Run folders are in ``--output``; a run that was stopped goes on. The report plays one episode of 20 s in each of
 ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
 film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
 """

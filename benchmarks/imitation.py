@@ -1,0 +1,120 @@
+"""Pre-training by imitation: how well do the primitives of MCP learn to follow reference motions?
+
+Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, for as
+many steps as ``CHARACTERS`` says. Run again, the script goes on where it stopped. It writes learning curves, returns
+with changing references, the tracking of every clip and films to ``benchmarks/results``, and with ``--publish`` the
+networks that come with the library to ``torchrl_mcp/pretrained``.
+"""
+
+import argparse
+import csv
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp import checkpoint, experiment
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis.figures import save_figure
+
+RESULTS = Path(__file__).resolve().parent / "results"
+CHARACTERS = {"biped": 12_000_000, "humanoid": 12_000_000, "trex": 12_000_000}
+COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
+MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
+EVALUATION_SEED = 12345
+
+
+def main() -> None:
+    """Train what is missing, evaluate, and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--output", type=Path, default=Path("runs/imitation"), help="folder of the run folders")
+    parser.add_argument("--characters", nargs="+", default=list(CHARACTERS), choices=CHARACTERS)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
+    parser.add_argument("--report", action="store_true", help="train nothing: report the runs as far as they are")
+    parser.add_argument("--publish", action="store_true", help="write the networks that come with the library, too")
+    parser.add_argument("--episodes", type=int, default=128, help="with changing references, of each evaluation")
+    parser.add_argument("--episodes-per-clip", type=int, default=16)
+    arguments = parser.parse_args()
+    runs = {character: arguments.output / f"imitation-{character}" for character in arguments.characters}
+    if not arguments.report:
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            list(pool.map(train, runs.values(), runs))
+    report(runs, arguments.episodes, arguments.episodes_per_clip)
+    if arguments.publish:
+        for character, run in runs.items():
+            experiment.publish(run, experiment.BUILTIN / f"mcp-{character}.torchrl")
+
+
+def train(run: Path, character: str) -> None:
+    """Train a character in a process of its own, or go on where a former one stopped."""
+    settings = [f"character={character}", f"training.total_frames={CHARACTERS[character]}", f"run_dir={run}"]
+    begun = (run / experiment.CONFIG).exists()
+    arguments = [f"resume={run}"] if begun else [*COMMON, *MACHINE, *settings]
+    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None:
+    """Write tables, curves and films to ``benchmarks/results``."""
+    facts = {character: cost(run) for character, run in runs.items()}
+    rows, clips = [], []
+    for character, run in runs.items():
+        for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
+            measures = numbers.pop("measures")
+            completed = 1 - numbers.pop("terminated")
+            row = {"character": character, "mode": mode, "completed": completed, **facts[character], **numbers}
+            rows.append(row | {"tracking_error": measures["tracking_error"], "machine": platform.machine()})
+            print(f"{character} {mode}: completed {completed:.0%}, {measures['tracking_error']:.3f} m", flush=True)
+        followed = experiment.evaluate_clips(run, episodes=episodes_per_clip, seed=EVALUATION_SEED)
+        clips += [{"character": character, **asdict(clip)} for clip in followed]
+    write_table(rows, RESULTS / "imitation.csv")
+    write_table(clips, RESULTS / "imitation_clips.csv")
+    curves = learning_curves({character: [run] for character, run in runs.items()}, quantity="episode/length")
+    write_curves(curves, RESULTS / "imitation_curves.csv")
+    save_figure(draw_curves(curves, ylabel="control steps per episode"), RESULTS / "imitation_curves")
+    for character, run in runs.items():
+        first, *others = film(run)
+        path = RESULTS / f"imitation_{character}.gif"
+        first.save(path, save_all=True, append_images=others, duration=1000 / 15, loop=0)
+
+
+def cost(run: Path) -> dict[str, float]:
+    """Steps and seconds of training behind the newest checkpoint."""
+    frames = int(checkpoint.find(run).stem.partition("-")[2])
+    seconds = next(row["seconds"] for row in read_metrics(run) if row["frames"] == frames)
+    return {"frames": frames, "training_seconds": round(seconds), "steps_per_second": round(frames / seconds)}
+
+
+def write_table(rows: list[dict], path: Path) -> None:
+    """Write rows of equal keys as CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@torch.no_grad()
+def film(run: Path, seconds: float = 8.0) -> Iterator[Image.Image]:
+    """Yield pictures of the deterministic policy, 15 per second."""
+    _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+    state = env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for step in range(round(30 * seconds)):
+            action = agent.actor.policy(state.select("observation", "goal"))["action"]
+            _, state = env.step_and_maybe_reset(state.set("action", action))
+            if step % 2:
+                picture = Image.fromarray(env.render(width=320, height=240, distance=3.5).numpy())
+                yield picture.quantize(64)
+    env.close()
+
+
+if __name__ == "__main__":
+    main()
