@@ -1,5 +1,7 @@
 """Pictures of a simulation, without a display."""
 
+from typing import ClassVar
+
 import mujoco
 import numpy as np
 import torch
@@ -22,16 +24,21 @@ class Camera:
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
 
+    _failure: ClassVar[Exception | None] = None  # MuJoCo ends the process when asked again
+
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1) -> None:
         buffer = model.vis.global_
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
-        try:
-            self.renderer = mujoco.Renderer(model, height, width)
-        except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+        if Camera._failure is None:
+            try:
+                self.renderer = mujoco.Renderer(model, height, width)
+            except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+                Camera._failure = error
+        if Camera._failure is not None:
             raise RuntimeError(
                 "MuJoCo found no OpenGL to draw with. Without a display, set the environment variable MUJOCO_GL before "
                 "Python starts: to egl (Debian: apt install libegl1) or to osmesa (Debian: apt install libosmesa6)"
-            ) from error
+            ) from Camera._failure
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self.view.trackbodyid = body

@@ -62,3 +62,22 @@ def test_without_opengl_the_error_names_what_to_install(tmp_path):
     assert result.returncode != 0
     assert "RuntimeError: MuJoCo found no OpenGL" in result.stderr
     assert "libosmesa6" in result.stderr
+
+
+def test_drawing_again_without_a_display_fails_again_and_does_not_end_the_process(tmp_path):
+    code = """
+from torchrl_mcp.envs import Holdout
+for _ in range(2):
+    env = Holdout(1, (0, 1))
+    env.reset()
+    try:
+        env.render()
+    except RuntimeError as error:
+        print(error)
+"""
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")} | {
+        "MUJOCO_GL": "glfw"
+    }
+    result = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("MuJoCo found no OpenGL") == 2
