@@ -52,7 +52,12 @@ def main() -> None:
 
 def train(run: Path, character: str) -> None:
     """Train a character in a process of its own, or go on where a former one stopped."""
-    settings = [f"character={character}", "character.action_std=0.15", f"training.total_frames={CHARACTERS[character]}", "progress_bar=false"]
+    settings = [
+        f"character={character}",
+        "character.action_std=0.15",
+        f"training.total_frames={CHARACTERS[character]}",
+        "progress_bar=false",
+    ]
     begun = (run / experiment.CONFIG).exists()
     arguments = [f"resume={run}"] if begun else [*COMMON, *settings, f"run_dir={run}"]
     command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]

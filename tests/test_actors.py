@@ -19,7 +19,9 @@ from torchrl_mcp.actors import (
 )
 from torchrl_mcp.critics import value_critic
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
-from torchrl_mcp.modules import Gating, GaussianPolicy, Primitives
+from torchrl_mcp.injection import injected_actor, injected_parts
+from torchrl_mcp.latent import latent_actor, latent_parts
+from torchrl_mcp.modules import Gating, GaussianPolicy, GoalEncoder, InjectedPolicy, Primitives
 from torchrl_mcp.objectives import BoundedClipPPOLoss
 
 S, G, A, K = 6, 2, 3, 4
@@ -27,7 +29,8 @@ GATING = partial(Gating, state_cells=(16, 8), goal_cells=(16, 8), joint_cells=(8
 PRIMITIVES = partial(Primitives, trunk_cells=(16, 8), branch_cells=8)
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
 ACTIVATIONS = {"sigmoid": nn.Sigmoid(), "softmax": nn.Softmax(dim=-1)}
-ACTORS = ["composite", "composite-frozen", "composite-additive", "composite-additive-frozen", "weights", "gaussian"]
+COMPOSITES = ["composite", "composite-frozen", "composite-additive", "composite-additive-frozen", "weights"]
+ACTORS = [*COMPOSITES, "gaussian", "injected", "latent"]
 
 
 def composite(mixer="multiplicative", activation="sigmoid", num_primitives=K, gain=1.0, **kwargs):
@@ -58,6 +61,14 @@ def make(name):
     if name == "gaussian":
         parts = gaussian_parts(S, G, A, policy=partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0))
         actor = gaussian_actor(parts)
+    elif name == "injected":
+        policy = partial(InjectedPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
+        parts = injected_parts(S, G, A, policy=policy, blind=False)
+        actor = injected_actor(parts)
+    elif name == "latent":
+        decoder = partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
+        parts = latent_parts(S, G, A, encoder=partial(GoalEncoder, num_cells=(8,)), decoder=decoder, latent_dim=2)
+        actor = latent_actor(parts)
     elif name == "weights":
         parts = composite(mixer)
         actor = weights_actor(parts, **heads, logits_std=0.2, frozen=frozen)
@@ -109,17 +120,28 @@ def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_fo
 
 
 @pytest.mark.parametrize(
-    ("method", "parameters"),
+    ("method", "stage", "parameters"),
     [
-        # tests/modules has the arithmetic
-        ("mcp", {"gating": 451_848, "primitives": 781_840, "critic": 635_905}),
-        ("scratch", {"policy": 644_113, "critic": 635_905}),
+        # tests/modules has the arithmetic; the goal is that of imitation, 208, or of heading, 2.
+        # State and goal enter the critic's 1024 units: (105+208)*1024+1024 + 1024*512+512 + 512*1+1 = 846849.
+        # mcp: the goal encoder's 208*512+512 = 107008 in place of 2*512+512 = 1536
+        ("mcp", "pretrain", {"gating": 557_320, "primitives": 781_840, "critic": 846_849}),
+        ("mcp", "transfer", {"gating": 451_848, "primitives": 781_840, "critic": 635_905}),
+        ("scratch", "transfer", {"policy": 644_113, "critic": 635_905}),
+        ("finetune", "pretrain", {"policy": 642_065, "goal_input": 212_992, "critic": 846_849}),
+        ("finetune", "transfer", {"policy": 642_065, "goal_input": 2_048, "critic": 635_905}),
+        ("moe", "pretrain", {"gating": 850_440, "primitives": 772_880, "critic": 846_849}),
+        ("moe", "transfer", {"gating": 639_496, "primitives": 772_880, "critic": 635_905}),
+        # Decoder: (105+8)*1024+1024 + 1024*512+512 + 512*17+17 = 116736 + 524800 + 8721
+        ("latent_space", "pretrain", {"encoder": 88_464, "decoder": 650_257, "critic": 846_849}),
+        ("latent_space", "transfer", {"encoder": 643_600, "decoder": 650_257, "critic": 635_905}),
     ],
 )
-def test_the_configuration_builds_figure_3_for_the_biped(method, parameters):
-    cfg = configure(f"method={method}")
-    parts = instantiate(cfg.parts)(105, 2, 17)
-    instantiate(cfg.critic)(parts, 105, 2)
+def test_the_configuration_builds_appendix_e_for_the_biped(method, stage, parameters):
+    task, goal_dim = {"pretrain": ("imitation", 208), "transfer": ("heading", 2)}[stage]
+    cfg = configure(f"method={method}", f"stage={stage}", f"task={task}", "character=biped")
+    parts = instantiate(cfg.parts)(105, goal_dim, 17)
+    instantiate(cfg.critic)(parts, 105, goal_dim)
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert counts == {"observation_normaliser": 0, "goal_normaliser": 0, **parameters}
 
@@ -323,7 +345,7 @@ def test_the_loss_needs_only_what_the_actor_says_it_stores(name):
     for key in ("loss_objective", "loss_critic", "loss_bound"):
         torch.testing.assert_close(report[key], expected[key])
     sum(value for key, value in report.items() if key.startswith("loss_")).backward()
-    for part in ("gating", "policy", "critic"):
+    for part in ("gating", "policy", "goal_input", "encoder", "decoder", "critic"):
         if part in parts:
             assert all(parameter.grad is not None for parameter in parts[part].parameters())
 

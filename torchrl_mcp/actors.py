@@ -1,8 +1,11 @@
-"""Networks become TensorDictModules here: with :mod:`torchrl_mcp.critics`, the only place that names tensordict keys.
+"""Networks become TensorDictModules.
+
+Here, in :mod:`~torchrl_mcp.latent`, :mod:`~torchrl_mcp.injection` and :mod:`~torchrl_mcp.critics`: the only places that
+name tensordict keys.
 
 A method first makes named *parts*, plain modules that transfer keeps, freezes or starts anew by their names, and then
 an :class:`Actor` over them: the ``policy`` that acts, and what the loss differentiates, ``trained``. Both are one and
-the same unless the primitives are frozen or the exploration acts on the gate.
+the same unless the primitives are frozen, the exploration acts on the gate, or noise enters before the action.
 
 | key | content | shape |
 |---|---|---|
@@ -158,7 +161,7 @@ def composite_actor(
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_logits"]),
         TensorDictModule(gate_activation, in_keys=["gate_logits"], out_keys=["gates"]),
     )
-    head = _sampler("action", distribution_class, loc=PRIMITIVES[0], scale=PRIMITIVES[1], gates="gates")
+    head = sampler("action", distribution_class, loc=PRIMITIVES[0], scale=PRIMITIVES[1], gates="gates")
     policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), primitives, *gate, head)
     if "primitives" not in frozen:
         return Actor(policy, policy, stored=("gates",))
@@ -198,7 +201,7 @@ def weights_actor(
         normalise_inputs(parts),
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_loc"]),
         TensorDictModule(ConstantScale(logits_std), in_keys=["gate_loc"], out_keys=["gate_scale"]),
-        _sampler("gate_logits", IndependentNormal, loc="gate_loc", scale="gate_scale"),
+        sampler("gate_logits", IndependentNormal, loc="gate_loc", scale="gate_scale"),
     )
     policy = TensorDictSequential(
         trained,
@@ -219,7 +222,7 @@ def gaussian_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Act
     policy = ProbabilisticTensorDictSequential(
         normalise_inputs(parts),
         TensorDictModule(parts["policy"], in_keys=[STATE, GOAL], out_keys=["loc", "scale"]),
-        _sampler("action", IndependentNormal, loc="loc", scale="scale"),
+        sampler("action", IndependentNormal, loc="loc", scale="scale"),
     )
     return Actor(policy, policy)
 
@@ -232,7 +235,7 @@ def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
     )
 
 
-def _sampler(
+def sampler(
     out_key: str, distribution_class: Callable[..., Distribution], **in_keys: NestedKey
 ) -> ProbabilisticTensorDictModule:
     """Return the module that draws ``out_key`` and stores its log-probability as ``<out_key>_log_prob``."""

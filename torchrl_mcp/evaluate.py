@@ -34,6 +34,8 @@ def main() -> None:
             f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
             + "".join(f", {name} {value:.3f}" for name, value in numbers["measures"].items())
         )
+        for name, value in numbers["diagnostics"].items():
+            print(f"    {name:26} {value:.3f}")
     if clips:
         print(f"  {'clip':28} seconds  completed  tracking error  length")
     for clip in clips:

@@ -1,10 +1,10 @@
 """How good is a policy? One episode in each of many environments."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
@@ -21,6 +21,7 @@ class Evaluation:
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
         measures: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
             as ``success``; of a number, its mean over the steps, as ``tracking_error``.
+        decisions: What was recorded of the policy, of all steps of all episodes, batch size ``(M,)``.
     """
 
     returns: Tensor
@@ -28,6 +29,7 @@ class Evaluation:
     terminated: Tensor
     positions: Tensor
     measures: dict[str, Tensor] = field(default_factory=dict)
+    decisions: TensorDictBase = field(default_factory=TensorDict)
 
 
 @torch.no_grad()
@@ -37,6 +39,7 @@ def evaluate(
     *,
     deterministic: bool = True,
     start: TensorDictBase | None = None,
+    record: Collection[NestedKey] = (),
     device: torch.device | str = "cpu",
 ) -> Evaluation:
     """Play one episode in each environment of a batch, to its end.
@@ -44,10 +47,11 @@ def evaluate(
     Counting the first episodes to finish instead would favour short ones.
 
     Args:
-        policy: From ``observation`` and ``goal`` to ``action``.
+        policy: From what the environments show, as ``observation`` and ``goal``, to ``action``.
         env: Environments with batch size ``[N]`` whose episodes all end; what ``env.measure_names`` lists is measured.
         deterministic: Play the deterministic action rather than a sample.
         start: State to begin from, as of ``env.get_state()``, or None to draw it.
+        record: Keys of what the policy writes that are kept as ``decisions``.
         device: Where the policy is.
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
@@ -57,6 +61,7 @@ def evaluate(
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     terminated = torch.zeros_like(running)
     positions: list[Tensor] = []
+    decisions: list[TensorDictBase] = []
     flags: dict[str, Tensor] = {}
     sums: dict[str, Tensor] = {}
     names = getattr(env, "measure_names", {})
@@ -65,8 +70,9 @@ def evaluate(
         kind[key] = torch.zeros_like(state[key])
     with set_exploration_type(exploration):
         while running.any():
-            action = policy(state.select("observation", "goal").to(device))["action"]
-            step, state = env.step_and_maybe_reset(state.set("action", action.to(env.device)))
+            decision = policy(state.select(*policy.in_keys).to(device))
+            decisions.append(decision.select(*record)[running.to(device)])
+            step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))
             outcome = step["next"]
             returns += outcome["reward"].squeeze(-1) * running
             lengths += running
@@ -83,7 +89,7 @@ def evaluate(
         for key, values in (flags | means).items()
         for name, value in zip(names[key], values.unbind(-1), strict=True)
     }
-    return Evaluation(returns, lengths, terminated, torch.stack(positions), measures)
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), measures, torch.cat(decisions))
 
 
 def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:

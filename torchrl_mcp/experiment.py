@@ -11,13 +11,16 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torchrl.envs import Compose
 from torchrl.record.loggers.common import Logger
 
 from torchrl_mcp import checkpoint
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.analysis.imitation import ClipResult, follow_each
+from torchrl_mcp.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation import evaluate, summary
+from torchrl_mcp.memory import TransformedCharacterEnv
 from torchrl_mcp.record import Record
 from torchrl_mcp.training import Trainer
 from torchrl_mcp.transfer import FrozenParts, require_parts
@@ -35,8 +38,8 @@ class Agent:
     frozen: FrozenParts
 
 
-def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv:
-    """Return the environments of the configured task and stage.
+def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
+    """Return the environments of the configured task and stage, with the transforms that the method needs, if any.
 
     Raises:
         ValueError: If the task has no such stage.
@@ -46,7 +49,10 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
             f"task={cfg.task.name} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
             f"task={cfg.task.name} with stage=transfer and checkpoint=<folder of the pre-training>"
         )
-    return instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
+    env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
+    if not (transforms := instantiate(cfg.get("transforms", []))):
+        return env
+    return TransformedCharacterEnv(env, Compose(*transforms))
 
 
 def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
@@ -66,16 +72,21 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     return Agent(parts, actor, critic, frozen)
 
 
-def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv, folder: Path) -> Trainer:
-    """Return the trainer of an agent."""
+def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv | TransformedCharacterEnv, folder: Path) -> Trainer:
+    """Return the trainer of an agent.
+
+    A method whose samples last for several steps, such as choices, names a ``batch_factor`` by which its batches are
+    larger than ``training.frames_per_batch``.
+    """
     trainable = {
         "actor": [p for p in agent.actor.trained.parameters() if p.requires_grad],
         "critic": list(agent.parts["critic"].parameters()),
     }
-    optimizers = {f"{name}_optimizer": instantiate(cfg.optimizer[name])(p) for name, p in trainable.items()}
+    optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
     loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
-    loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob, value="state_value")
+    loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
     training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
+    training["frames_per_batch"] *= cfg.get("batch_factor", 1)
     return Trainer(
         env=env,
         parts=agent.parts,
@@ -83,7 +94,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv, folder: Path)
         critic=agent.critic,
         loss=loss,
         advantages=instantiate(cfg.objective.advantages)(agent.critic),
-        **optimizers,
+        optimizers=optimizers,
         frozen=agent.frozen,
         record=Record(folder),
         checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
@@ -135,7 +146,7 @@ def resume(folder: Path) -> Path:
 
 def restore(
     path: Path, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
-) -> tuple[DictConfig, Agent, CharacterEnv]:
+) -> tuple[DictConfig, Agent, CharacterEnv | TransformedCharacterEnv]:
     """Return configuration, trained agent and fresh environments from a run folder or checkpoint file.
 
     Args:
@@ -160,6 +171,8 @@ def restore(
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
     """Return the :func:`~torchrl_mcp.evaluation.summary` of a run's policy, ``deterministic`` and ``stochastic``.
 
+    Each has the :func:`~torchrl_mcp.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+
     Args:
         path: Run folder, of which the newest checkpoint counts, or checkpoint file.
         episodes: Episodes, one per environment.
@@ -173,8 +186,10 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
     for mode in ("deterministic", "stochastic"):
         _, agent, env = restore(path, num_envs=episodes, seed=seed, **kwargs)
         torch.manual_seed(seed)
-        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic")
+        record = diagnosed(agent.actor)
+        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
         results[mode] = summary(outcome, env.normalised_return)
+        results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
     return results
 
 

@@ -1,44 +1,56 @@
 """The training loop: collect, estimate advantages, update, record. One loop for every method."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector
-from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
+from torchrl.objectives import KLAdaptiveLR, LossModule
 from tqdm import tqdm
 
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.checkpoint import load, run_checkpoint
+from torchrl_mcp.diagnostics import diagnostics
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.episodes import EpisodeStatistics
-from torchrl_mcp.modules import RunningNormaliser, gate_diagnostics
-from torchrl_mcp.objectives import Advantages
+from torchrl_mcp.memory import TransformedCharacterEnv
+from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.progress import SECTIONS, Progress, Stopwatch
 from torchrl_mcp.record import Record
 from torchrl_mcp.transfer import FrozenParts
 
 
+class Estimator(Protocol):
+    """What makes samples for the loss from trajectories."""
+
+    out_keys: Sequence[NestedKey]
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the samples to learn from, with ``out_keys``, of trajectories ``(N, T)``."""
+        ...
+
+
 class Trainer:
-    """Proximal policy optimisation of an actor and a critic in one batch of environments.
+    """Policy optimisation of an actor and a critic in one batch of environments.
 
     Args:
-        env: Environments, batch size ``[N]``.
+        env: Environments, batch size ``[N]``, with or without transforms.
         parts: All parts of the agent by name.
         actor: The actor over those parts.
         critic: The value function over those parts.
         loss: Their loss; every output whose name begins with ``loss_`` is minimised.
-        advantages: Estimator of advantages and value targets.
-        actor_optimizer: Optimiser of the trainable parameters of the actor.
-        critic_optimizer: Optimiser of the parameters of the critic.
+        advantages: From trajectories ``(N, T)`` to the samples to learn from, of any batch shape, with the keys
+            ``advantages.out_keys`` that the loss reads beside what the policy stores.
+        optimizers: Optimisers of all that is trained: of the ``critic``, and of the ``actor`` unless it is frozen.
         frozen: Parts that must not change, checked in every iteration.
         record: Where metrics go.
         checkpoints: Where checkpoints go.
@@ -61,14 +73,13 @@ class Trainer:
     def __init__(
         self,
         *,
-        env: CharacterEnv,
+        env: CharacterEnv | TransformedCharacterEnv,
         parts: nn.ModuleDict,
         actor: Actor,
         critic: TensorDictModuleBase,
-        loss: ClipPPOLoss,
-        advantages: Advantages,
-        actor_optimizer: Optimizer,
-        critic_optimizer: Optimizer,
+        loss: LossModule,
+        advantages: Estimator,
+        optimizers: Mapping[str, Optimizer],
         frozen: FrozenParts,
         record: Record,
         checkpoints: CheckpointRotation,
@@ -91,8 +102,10 @@ class Trainer:
             )
         self.env, self.parts, self.actor, self.critic, self.loss = env, parts, actor, critic, loss
         self.advantages = advantages
-        self.optimizers = {"actor": actor_optimizer, "critic": critic_optimizer}
-        self.schedule = step_size_schedule(actor_optimizer) if step_size_schedule else None
+        self.optimizers = dict(optimizers)
+        self.schedule = (
+            step_size_schedule(optimizers["actor"]) if step_size_schedule and "actor" in optimizers else None
+        )
         self.frozen, self.record, self.checkpoints, self.config = frozen, record, checkpoints, config
         self.total_frames, self.frames_per_batch = total_frames, frames_per_batch
         self.minibatch_size, self.num_epochs, self.max_grad_norm = minibatch_size, num_epochs, max_grad_norm
@@ -101,8 +114,7 @@ class Trainer:
         self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(env.batch_size[0]), Stopwatch()
         self.checkpoint: Checkpoint = run_checkpoint(
             parts,
-            actor_optimizer=actor_optimizer,
-            critic_optimizer=critic_optimizer,
+            **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()},
             environment=env,
             episodes=self.episodes,
             frozen=frozen,
@@ -123,7 +135,7 @@ class Trainer:
                 with self._precision(), _one_thread():
                     batch = next(batches)
                 self.stopwatch.add("physics", self.env.physics_seconds - physics)
-                metrics = self._episode_metrics(batch) | self._gate_metrics(batch)
+                metrics = self._episode_metrics(batch) | diagnostics(self.actor, batch)
                 with self.stopwatch("update"):
                     with self._precision():
                         samples = self.advantages(batch)
@@ -149,8 +161,9 @@ class Trainer:
         self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
 
     def _collector(self) -> Collector:
-        keys = ["action", self.actor.log_prob, *self.actor.stored]
-        behaviour = TensorDictSequential(self.actor.policy, selected_out_keys=list(dict.fromkeys(keys)))
+        kept = {"action", self.actor.log_prob, *self.actor.stored}
+        keys = [key for key in dict.fromkeys(self.actor.policy.out_keys) if key in kept]
+        behaviour = TensorDictSequential(self.actor.policy, selected_out_keys=keys)
         self.stopwatch.watch("forward", behaviour)
         random = GlobalRNGState().state_dict()
         collector = Collector(
@@ -184,15 +197,17 @@ class Trainer:
                 reports.append(report.detach())
         metrics = {f"loss/{key}": value for key, value in _mean(reports).items()}
         last = _mean(reports[-len(reports) // self.num_epochs :])
-        # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
-        metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
+        if "mean_ratio" in last:
+            # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
+            metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
         self._require_finite(metrics)
         if self.schedule:
             self.schedule.step(metrics["loss/kl"])
-        metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
+        if "actor" in self.optimizers:
+            metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
         with torch.no_grad(), self._precision():
             distribution = self.actor.trained.get_dist(samples[: self.minibatch_size])
-        return metrics | {"policy/std": distribution.stddev.mean().item()}
+        return metrics | _spread(distribution)
 
     def _step(self, optimizer: Optimizer) -> Tensor:
         """Clip the gradient, step, and give the gradient's norm."""
@@ -236,11 +251,6 @@ class Trainer:
             metrics |= {f"task/{name}": mean for name, mean in zip(names, means.tolist(), strict=True)}
         return metrics
 
-    def _gate_metrics(self, batch: TensorDictBase) -> dict[str, float]:
-        if "gates" not in self.actor.stored:
-            return {}
-        return {f"gates/{key}": value.item() for key, value in gate_diagnostics(batch["gates"]).items()}
-
     def _advance(self, metrics: dict[str, float], seconds: float) -> None:
         """Count, record, and save if it is time."""
         progress = self.progress
@@ -276,6 +286,13 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(num_threads)
+
+
+def _spread(distribution: Distribution) -> dict[str, float]:
+    """How much a policy explores."""
+    if isinstance(distribution, Categorical):
+        return {"policy/entropy": distribution.entropy().mean().item()}
+    return {"policy/std": distribution.stddev.mean().item()}
 
 
 def _mean(reports: list[TensorDictBase]) -> dict[str, float]:

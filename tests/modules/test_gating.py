@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from torchrl_mcp.modules import Gating, gate_diagnostics
+from torchrl_mcp.modules import Gating, JointGating, gate_diagnostics
 
 
 def count(module):
@@ -117,3 +117,35 @@ def test_the_width_of_saturation_is_an_argument():
     gates = torch.tensor([0.01, 0.2, 0.5, 0.85])
     assert gate_diagnostics(gates.unsqueeze(0), saturation=0.02)["saturation"] == 0.25
     assert gate_diagnostics(gates.unsqueeze(0), saturation=0.3)["saturation"] == 0.75
+
+
+@pytest.mark.parametrize(
+    ("goal_dim", "num_primitives", "parameters"),
+    [
+        # (105+2)*1024+1024 + 1024*512+512 + 512*8+8: 110592 + 524800 + 4104
+        pytest.param(2, 8, 639_496, id="heading"),
+        # The goal shows two states of the reference: (105+208)*1024+1024 = 321536 in place of 110592
+        pytest.param(208, 8, 850_440, id="imitation"),
+        # The hierarchical model picks one of seven: 512*7+7 = 3591 in place of 4104
+        pytest.param(2, 7, 638_983, id="seven primitives"),
+    ],
+)
+def test_a_joint_gate_has_the_parameters_of_section_e6(goal_dim, num_primitives, parameters):
+    gating = JointGating(105, goal_dim, num_primitives)
+    assert count(gating) == parameters
+    logits = gating(torch.zeros(3, 4, 105), torch.zeros(3, 4, goal_dim))
+    assert logits.shape == (3, 4, num_primitives)
+
+
+def test_a_joint_gate_is_one_network_over_state_and_goal():
+    gating = JointGating(3, 2, 4, num_cells=(8, 6))
+    observation, goal = torch.randn(10, 3), torch.randn(10, 2)
+    first, _, second, _ = gating.body
+    hidden = second(first(torch.cat([observation, goal], -1)).relu()).relu()
+    torch.testing.assert_close(gating(observation, goal), gating.output(hidden))
+
+
+@pytest.mark.parametrize("gate", [Gating, JointGating])
+def test_logits_stay_float32_under_autocast(gate):
+    with torch.autocast("cpu", torch.bfloat16):
+        assert gate(27, 2, 8)(torch.randn(10, 27), torch.randn(10, 2)).dtype == torch.float32

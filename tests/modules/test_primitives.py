@@ -100,3 +100,26 @@ def test_a_batched_linear_starts_as_torch_s_linear_layers_do():
         linear = nn.Linear(64, 32)
         assert torch.equal(layers.weight[k].T, linear.weight)
         assert torch.equal(layers.bias[k], linear.bias)
+
+
+@pytest.mark.parametrize(
+    ("num_primitives", "parameters"),
+    # Trunk 105*1024+1024 + 1024*512+512 = 633344; per primitive 512*34+34 = 17442
+    [(8, 772_880), (1, 650_786)],
+)
+def test_with_linear_heads_they_have_the_parameters_of_section_e6(num_primitives, parameters):
+    primitives = Primitives(105, 17, num_primitives, trunk_cells=(1024, 512), branch_cells=0)
+    assert count(primitives) == parameters
+    loc, scale = primitives(torch.zeros(3, 4, 105))
+    assert loc.shape == scale.shape == (3, 4, num_primitives, 17)
+
+
+def test_linear_heads_are_linear_in_the_trunk_s_features():
+    primitives = Primitives(3, 2, 4, trunk_cells=(7, 6), branch_cells=0, initial_std=0.5)
+    observation = torch.randn(10, 3)
+    loc, scale = primitives(observation)
+    features = primitives.trunk[2](primitives.trunk[0](observation).relu()).relu()
+    for k in range(4):
+        output = F.linear(features, primitives.output.weight[k].T, primitives.output.bias[k])
+        torch.testing.assert_close(loc[:, k], output[:, :2])
+        torch.testing.assert_close(scale[:, k], output[:, 2:].exp())

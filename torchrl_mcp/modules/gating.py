@@ -1,4 +1,4 @@
-"""The gating network of Figure 3 and what its weights say."""
+"""Gating networks and what their weights say."""
 
 from collections.abc import Sequence
 
@@ -49,6 +49,38 @@ class Gating(nn.Module):
         """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         features = torch.cat([self.state_encoder(observation), self.goal_encoder(goal)], dim=-1)
         return self.output(self.joint(features)).float()
+
+
+class JointGating(nn.Module):
+    r"""Gate logits from one network over state and goal, without encoders of their own.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        num_primitives: Number of logits, ``K``.
+        num_cells: Hidden units.
+        output_gain: Factor on the initial weights of the output layer; small values start all gates alike.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Sections E.4 and E.6. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        goal_dim: int,
+        num_primitives: int,
+        *,
+        num_cells: Sequence[int] = (1024, 512),
+        output_gain: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.body = relu_mlp(observation_dim + goal_dim, num_cells)
+        self.output = scaled_linear(num_cells[-1], num_primitives, output_gain)
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
+        return self.output(self.body(observation, goal)).float()
 
 
 def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:

@@ -39,14 +39,23 @@ class GaussianPolicy(nn.Module):
         output_gain: float = 0.01,
     ) -> None:
         super().__init__()
-        scale = torch.as_tensor(std, dtype=torch.float32)
-        if scale.numel() not in (1, action_dim) or not (scale > 0).all():
-            raise ValueError(f"std must be one positive number or {action_dim} of them, one per action, got {std}")
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
-        self.register_buffer("scale", scale.expand(action_dim).clone())
+        self.register_buffer("scale", fixed_scale(std, action_dim))
 
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``(*B, A)``, from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         loc = self.output(self.body(observation, goal))
         return loc, self.scale.expand_as(loc)
+
+
+def fixed_scale(std: float | Sequence[float], action_dim: int) -> Tensor:
+    """Return standard deviations, shape ``(A,)``, from one for all actions or one each.
+
+    Raises:
+        ValueError: If ``std`` is not positive or is neither one number nor one per action.
+    """
+    scale = torch.as_tensor(std, dtype=torch.float32)
+    if scale.numel() not in (1, action_dim) or not (scale > 0).all():
+        raise ValueError(f"std must be one positive number or {action_dim} of them, one per action, got {std}")
+    return scale.expand(action_dim).clone()

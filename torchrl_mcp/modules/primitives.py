@@ -1,4 +1,4 @@
-"""The primitives of Figure 3: K Gaussians that see the state and never the goal."""
+"""K Gaussian primitives that see the state and never the goal."""
 
 import math
 from collections.abc import Sequence
@@ -12,15 +12,16 @@ from torchrl_mcp.modules.gating import relu_mlp
 class Primitives(nn.Module):
     r"""K Gaussian primitives :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` on one shared trunk.
 
-    The trunk is followed by one hidden layer and one linear output layer per primitive. The branches are evaluated
-    together as batched matrix products.
+    The trunk is followed by one hidden layer and one linear output layer per primitive, as in Figure 3, or by the
+    linear layers alone, as in the mixture of experts. What each primitive has for itself is evaluated together with the
+    others' as batched matrix products.
 
     Args:
         observation_dim: Size of the state, ``S``.
         action_dim: Size of the action, ``A``.
         num_primitives: Number of primitives, ``K``.
         trunk_cells: Hidden units shared by all primitives.
-        branch_cells: Hidden units of each primitive's own layer.
+        branch_cells: Hidden units of each primitive's own layer; 0 for none.
         initial_std: Standard deviation of every primitive before training, in action units.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
 
@@ -28,7 +29,7 @@ class Primitives(nn.Module):
         ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
 
     Reference:
-        Peng et al., *MCP*, NeurIPS 2019, Figure 3 and Eq. 4. https://arxiv.org/abs/1905.09808
+        Peng et al., *MCP*, NeurIPS 2019, Figure 3, Eq. 4 and Section E.6. https://arxiv.org/abs/1905.09808
     """
 
     def __init__(
@@ -48,8 +49,8 @@ class Primitives(nn.Module):
         if not initial_std > 0:
             raise ValueError(f"initial_std must be positive, got {initial_std}")
         self.trunk = relu_mlp(observation_dim, trunk_cells)
-        self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells)
-        self.output = BatchedLinear(num_primitives, branch_cells, 2 * action_dim)
+        self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
+        self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], 2 * action_dim)
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
             self.output.bias.zero_()
@@ -58,7 +59,9 @@ class Primitives(nn.Module):
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
         features = self.trunk(observation).unsqueeze(-2)
-        loc, log_scale = self.output(self.branches(features).relu()).chunk(2, dim=-1)
+        if self.branches is not None:
+            features = self.branches(features).relu()
+        loc, log_scale = self.output(features).chunk(2, dim=-1)
         return loc, log_scale.float().exp()
 
 

@@ -1,0 +1,234 @@
+"""The option-critic's estimates against their definitions, its gradients against exact ones, and that it learns."""
+
+from statistics import mean, stdev
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from torch import nn
+from torch.distributions import Categorical
+
+from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss
+
+GAMMA, STATES, OPTIONS, ACTIONS = 0.9, 4, 2, 3
+
+
+class Options(nn.Module):
+    """Policies and terminations as tables."""
+
+    def __init__(self, seed=0):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.policies = nn.Parameter(torch.randn(OPTIONS, STATES, ACTIONS, generator=generator).double())
+        self.terminations = nn.Parameter(torch.randn(OPTIONS, STATES, generator=generator).double())
+
+    def forward(self, state, option, arrival):
+        return self.policies[option, state], self.terminations[option, arrival].sigmoid()
+
+
+class Problem:
+    """A random Markov decision process with a fixed policy over options, solved exactly."""
+
+    def __init__(self, seed=1):
+        generator = torch.Generator().manual_seed(seed)
+        self.transitions = torch.randn(STATES, ACTIONS, STATES, generator=generator).double().softmax(-1)
+        self.rewards = torch.randn(STATES, ACTIONS, generator=generator).double()
+        self.choice = torch.randn(STATES, OPTIONS, generator=generator).double().softmax(-1)
+
+    def resolvent(self, pi, beta):
+        """Discounted visits to states and options from states and options, ``(S K, S K)``."""
+        moves = torch.einsum("ksa,sat->skt", pi, self.transitions)
+        same = torch.eye(OPTIONS, dtype=torch.float64)
+        arrivals = (1 - beta).unsqueeze(-1) * same.unsqueeze(1) + beta.unsqueeze(-1) * self.choice
+        chain = torch.einsum("skt,ktj->sktj", moves, arrivals).reshape(STATES * OPTIONS, -1)
+        return torch.linalg.inv(torch.eye(STATES * OPTIONS, dtype=torch.float64) - GAMMA * chain)
+
+    def values(self, pi, beta):
+        """Q(s, omega) of the Markov chain over states and options, ``(S, K)``."""
+        rewards = torch.einsum("ksa,sa->sk", pi, self.rewards)
+        return (self.resolvent(pi, beta) @ rewards.flatten()).view(STATES, OPTIONS)
+
+
+def tabular_loss(options, values=None, **kwargs):
+    actor = ProbabilisticTensorDictSequential(
+        TensorDictModule(
+            options, in_keys=["observation", "option", ("next", "observation")], out_keys=["logits", "termination"]
+        ),
+        ProbabilisticTensorDictModule(["logits"], ["action"], distribution_class=Categorical, return_log_prob=True),
+    )
+    table = nn.Embedding(STATES, OPTIONS, dtype=torch.float64)
+    if values is not None:
+        table.weight.data.copy_(values)
+    critic = TensorDictModule(table, in_keys=["observation"], out_keys=["option_values"])
+    return OptionCriticLoss(actor, critic, **{"clip_epsilon": 0.2, "bound_coeff": 0.0, **kwargs})
+
+
+def every_step():
+    """All states, options, actions and next states, each ``(n,)``."""
+    index = torch.cartesian_prod(*[torch.arange(n) for n in (STATES, OPTIONS, ACTIONS, STATES)]).unbind(-1)
+    return dict(zip(("observation", "option", "action", "arrival"), index, strict=True))
+
+
+def exact_samples(problem, options, start):
+    """Every step once, its estimates weighted by its discounted probability from ``start`` on."""
+    step = every_step()
+    s, k, a, t = step.values()
+    pi, beta = options.policies.detach().softmax(-1), options.terminations.detach().sigmoid()
+    values = problem.values(pi, beta)
+    over_options = (problem.choice * values).sum(-1)
+    upon_arrival = values - beta.T * (values - over_options.unsqueeze(-1))
+    weight = problem.resolvent(pi, beta)[start].view(STATES, OPTIONS)[s, k] * pi[k, s, a]
+    weight = weight * problem.transitions[s, a, t] * len(s)
+    advantage = problem.rewards[s, a] + GAMMA * upon_arrival[t, k] - values[s, k]
+    return TensorDict(
+        {
+            **{key: step[key] for key in ("observation", "option", "action")},
+            "next": {"observation": t},
+            "action_log_prob": pi.log()[k, s, a],
+            "advantage": (weight * advantage).unsqueeze(-1),
+            "termination_advantage": (weight * GAMMA * (values[t, k] - over_options[t])).unsqueeze(-1),
+            "value_target": values[s, k].unsqueeze(-1),
+        },
+        batch_size=len(s),
+    )
+
+
+@pytest.mark.parametrize("start", [0, 5])
+def test_its_gradients_are_those_of_the_exact_value(start):
+    problem, options = Problem(), Options()
+    value = problem.values(options.policies.softmax(-1), options.terminations.sigmoid()).flatten()[start]
+    expected = torch.autograd.grad(-value, [options.policies, options.terminations])
+
+    report = tabular_loss(options)(exact_samples(problem, options, start))
+    (report["loss_objective"] + report["loss_termination"]).backward()
+    torch.testing.assert_close(options.policies.grad, expected[0], atol=1e-10, rtol=1e-8)
+    torch.testing.assert_close(options.terminations.grad, expected[1], atol=1e-10, rtol=1e-8)
+    assert options.terminations.grad.abs().max() > 1e-3
+
+
+def test_values_regress_to_their_targets_where_the_option_acted():
+    problem, options = Problem(), Options()
+    samples = exact_samples(problem, options, 0)
+    loss = tabular_loss(options)
+    error = loss.critic_network.module.weight.detach() - problem.values(
+        options.policies.softmax(-1), options.terminations.sigmoid()
+    )
+    loss(samples)["loss_critic"].backward()
+    # Each of the S K entries has the same share of the samples.
+    expected = (error / (STATES * OPTIONS)).detach()
+    torch.testing.assert_close(loss.critic_network.module.weight.grad, expected)
+
+
+def test_the_ratio_is_clipped_when_samples_are_used_again():
+    options = Options()
+    samples = exact_samples(Problem(), options, 0)
+    samples["advantage"] = torch.ones_like(samples["advantage"])
+    samples["action_log_prob"] = samples["action_log_prob"] - 1.0
+    report = tabular_loss(options, clip_epsilon=0.2)(samples)
+    assert report["loss_objective"].item() == pytest.approx(-1.2)
+    assert report["mean_ratio"].item() == pytest.approx(torch.tensor(1.0).exp().item())
+    assert report["kl_approx"].item() == pytest.approx(-1.0)
+    report["loss_objective"].backward()
+    assert not options.policies.grad.any()
+
+
+def test_frozen_options_leave_the_values_alone_to_learn():
+    options = Options().requires_grad_(False)
+    loss = tabular_loss(options)
+    report = loss(exact_samples(Problem(), options, 0).select(*loss.in_keys).exclude("next"))
+    assert list(report.keys()) == loss.out_keys == ["loss_critic"]
+
+
+def test_it_is_called_with_tensors_by_name_as_well():
+    options = Options()
+    samples, loss = exact_samples(Problem(), options, 0), tabular_loss(options)
+    names = {key if isinstance(key, str) else "_".join(key): samples[key] for key in loss.in_keys}
+    outputs = loss(**names)
+    for key, value in zip(loss.out_keys, outputs, strict=True):
+        assert value == loss(samples)[key], key
+
+
+def test_means_out_of_bounds_are_penalised():
+    loss = tabular_loss(Options(), bound_coeff=3.0)
+    distribution = torch.distributions.Normal(torch.tensor([[1.5, -0.5], [-2.0, 1.0]]), 1.0)
+    assert loss._bound_penalty(distribution, torch.zeros(2)).item() == pytest.approx(3.0 * (0.25 + 1.0) / 2)
+
+
+GOES_ON, TERMINATED, TRUNCATED = range(3)
+
+
+def random_batch(outcomes, seed=0):
+    """Rows of steps between numbered states, of which a time limit cuts off one that the next step does not show."""
+    generator = torch.Generator().manual_seed(seed)
+    outcomes = torch.tensor(outcomes)
+    shape = tuple(outcomes.shape)
+    states = torch.randint(0, STATES, (shape[0], shape[1] + 1), generator=generator)
+    ended = outcomes != GOES_ON
+    arrived = torch.where(ended, torch.randint(0, STATES, shape, generator=generator), states[:, 1:])
+    following = {
+        "observation": arrived,
+        "goal": 1 - arrived % 2,
+        "reward": torch.randn(*shape, 1, generator=generator),
+        "terminated": (outcomes == TERMINATED).unsqueeze(-1),
+        "truncated": (outcomes == TRUNCATED).unsqueeze(-1),
+        "done": ended.unsqueeze(-1),
+    }
+    option = torch.randint(0, OPTIONS, shape, generator=generator)
+    state = {"observation": states[:, :-1], "goal": 1 - states[:, :-1] % 2, "option": option}
+    return TensorDict(state, batch_size=shape).set("next", TensorDict(following, batch_size=shape))
+
+
+VALUES = torch.tensor([[0.5, -1.0], [2.0, 1.5], [-0.3, 0.4], [1.0, 3.0]])
+TERMINATIONS = torch.tensor([[0.1, 0.9], [0.5, 0.3], [0.7, 0.2], [0.05, 0.6]])
+
+
+def tabular_critic():
+    return TensorDictModule(
+        lambda state, goal: (VALUES[state] + goal.unsqueeze(-1), TERMINATIONS[state]),
+        in_keys=["observation", "goal"],
+        out_keys=["option_values", "terminations"],
+    )
+
+
+@pytest.mark.parametrize("lmbda", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("epsilon", [0.0, 0.2])
+def test_estimates_follow_the_definition(epsilon, lmbda):
+    gamma, cost, clip = 0.9, 0.01, 1.5
+    batch = random_batch(
+        [[GOES_ON] * 6, [GOES_ON, TERMINATED, GOES_ON, TRUNCATED, GOES_ON, GOES_ON], [GOES_ON] * 5 + [TERMINATED]]
+    )
+    values = (VALUES + (1 - torch.arange(STATES) % 2).unsqueeze(-1)).tolist()
+    advantages, targets, regrets = [], [], []
+    for row in batch.unbind(0):
+        later, estimated = 0.0, []
+        for step in reversed(row.unbind(0)):
+            here, there, option = step["observation"].item(), step["next", "observation"].item(), step["option"].item()
+            over_options = (1 - epsilon) * max(values[there]) + epsilon * mean(values[there])
+            gain = values[there][option] - over_options
+            ended, terminated = step["next", "done"].item(), step["next", "terminated"].item()
+            arrival = 0.0 if terminated else values[there][option] - TERMINATIONS[there][option].item() * gain
+            delta = (1 - gamma) * step["next", "reward"].item() + gamma * arrival - values[here][option]
+            later = delta + (0.0 if ended else gamma * lmbda * later)
+            regret = 0.0 if terminated else gain / (1 - gamma) + cost
+            estimated.insert(0, (later, later + values[here][option], regret))
+        for numbers, list_ in zip(zip(*estimated, strict=True), (advantages, targets, regrets), strict=True):
+            list_ += numbers
+    centre, spread = mean(advantages), stdev(advantages)
+    expected = {
+        "advantage": [min(max((number - centre) / spread, -clip), clip) for number in advantages],
+        "value_target": targets,
+        "termination_advantage": regrets,
+    }
+    settings = {"gamma": gamma, "lmbda": lmbda, "clip": clip, "epsilon": epsilon, "termination_cost": cost}
+    samples = OptionAdvantages(tabular_critic(), **settings)(batch)
+    for key, numbers in expected.items():
+        torch.testing.assert_close(samples[key].flatten(), torch.tensor(numbers), atol=1e-5, rtol=1e-5, msg=key)
+
+
+def test_the_termination_cost_makes_options_last():
+    options = Options()
+    samples = exact_samples(Problem(), options, 0)
+    samples["termination_advantage"] = torch.full_like(samples["termination_advantage"], 0.01)
+    tabular_loss(options)(samples)["loss_termination"].backward()
+    assert (options.terminations.grad > 0).all()

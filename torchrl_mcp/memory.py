@@ -1,0 +1,121 @@
+"""What a policy must remember from one step to the next, as part of what the environment shows.
+
+TorchRL's collectors know a policy's memory if the environment has a spec for it; the transforms here give it one.
+"""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform, TransformedEnv
+
+
+class TransformedCharacterEnv(TransformedEnv):
+    """Environments with transforms, of both of which the state can be set, saved and restored.
+
+    TorchRL's own class saves the transforms alone, and loses a state to reset to before it reaches the environments.
+    """
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """Return the state of the environments and of their transforms."""
+        return {"base_env": self.base_env.state_dict(), "transform": self.transform.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.base_env.load_state_dict(state_dict["base_env"])
+        self.transform.load_state_dict(state_dict["transform"])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if not kwargs.get("set_state"):
+            return super()._reset(tensordict, **kwargs)
+        began = self.base_env._reset(tensordict, **kwargs)
+        return self.transform._reset(began.empty(), began)
+
+
+class OptionMemory(Transform):
+    """Shows a policy the option of the step before, ``held_option``, and for how many steps it has acted.
+
+    ``held_steps`` is 0 at the beginning of an episode, where no option is held. The policy writes ``option`` and
+    whether it has chosen it in this step, ``begins``, each ``(N,)``; one that writes neither keeps what is held.
+
+    The memory is part of ``state_dict``: after loading it, the next reset of all environments returns to it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held: dict[str, Tensor] = {}
+        self._restored = False
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add ``held_option`` and ``held_steps``."""
+        return _with_integers(observation_spec, "held_option", "held_steps")
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return what is held."""
+        return {key: value.clone() for key, value in self._held.items()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Hold what :meth:`get_extra_state` gave."""
+        self._held, self._restored = {key: value.clone() for key, value in state.items()}, True
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        held, steps = tensordict["held_option"], tensordict["held_steps"]
+        begins = tensordict.get("begins", torch.zeros_like(steps, dtype=torch.bool))
+        option = tensordict.get("option", held)
+        self._held = {"held_option": option.clone(), "held_steps": steps.masked_fill(begins, 0) + 1}
+        return next_tensordict.update(self.get_extra_state())
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        mask = tensordict.get("_reset", None)
+        if mask is not None:
+            self._held = {key: value.masked_fill(mask.squeeze(-1), 0) for key, value in self._held.items()}
+        elif not self._restored:
+            nothing = torch.zeros(tensordict_reset.batch_size, dtype=torch.int64)
+            self._held = {"held_option": nothing, "held_steps": nothing}
+        self._restored = False
+        return tensordict_reset.update(self.get_extra_state())
+
+
+class ClipAsOption(Transform):
+    """Shows which reference motion each environment follows, as ``option``: every option imitates a clip of its own.
+
+    Args:
+        num_options: Number of options, and of the reference motions.
+
+    Raises:
+        ValueError: If the environment has another number of reference motions, when it is attached to it.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(self, num_options: int) -> None:
+        super().__init__()
+        self.num_options = num_options
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add ``option``."""
+        library = getattr(self.parent, "library", ())
+        if len(library) != self.num_options:
+            raise ValueError(
+                f"num_options={self.num_options} primitives need as many reference motions, one each, and there are "
+                f"{len(library)}: pre-train with task=imitation and motions of that number, such as motions=turning"
+            )
+        return _with_integers(observation_spec, "option")
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("option", self.parent.episode["clip"].clone())
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+def _with_integers(spec: TensorSpec, *names: str) -> TensorSpec:
+    """Return the spec with one integer per environment under each of the names."""
+    if not isinstance(spec, Composite):
+        raise TypeError(f"the environment observes {spec}, which has no names: a Composite is needed")
+    for name in names:
+        spec[name] = Unbounded(shape=spec.shape, device=spec.device, dtype=torch.int64)
+    return spec

@@ -1,0 +1,73 @@
+"""A policy network that can be given new inputs without a change of what it does."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+from torchrl_mcp.modules.gaussian import fixed_scale
+
+
+class InputInjection(nn.Linear):
+    """The weights ``(H, G)`` by which G new inputs enter H hidden units: zero at first, so that nothing changes.
+
+    Args:
+        in_features: Number of new inputs, ``G``.
+        out_features: Number of hidden units, ``H``.
+
+    Reference:
+        Berseth et al., *Progressive Reinforcement Learning with Distillation for Multi-Skilled Motion Control*,
+        ICLR 2018. https://arxiv.org/abs/1802.04765
+    """
+
+    def __init__(self, in_features: int, out_features: int) -> None:
+        super().__init__(in_features, out_features, bias=False)
+        nn.init.zeros_(self.weight)
+
+
+class InjectedPolicy(nn.Module):
+    r"""The network of the scratch model, its first layer split by its inputs.
+
+    .. math:: \mu = W_3 \operatorname{relu}(W_2 \operatorname{relu}(W_1 s + b_1 + j) + b_2) + b_3
+
+    The injection :math:`j = J g` comes from :class:`InputInjection`. It is added rather than concatenated because a
+    matrix product over more columns, be they zero, rounds differently.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        action_dim: Size of the action, ``A``.
+        num_cells: Hidden units, two layers or more.
+        std: Standard deviation, one for all actions or one each, in action units.
+        output_gain: Factor on the initial weights of the output layer.
+
+    Raises:
+        ValueError: If ``std`` is not positive or is neither one number nor one per action, or layers are missing.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808
+    """
+
+    scale: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        *,
+        num_cells: Sequence[int] = (1024, 512),
+        std: float | Sequence[float] = 0.1,
+        output_gain: float = 0.01,
+    ) -> None:
+        super().__init__()
+        if len(num_cells) < 2:
+            raise ValueError(f"num_cells must name two hidden layers or more, got {list(num_cells)}")
+        self.input = nn.Linear(observation_dim, num_cells[0])
+        self.body = relu_mlp(num_cells[0], num_cells[1:])
+        self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
+        self.register_buffer("scale", fixed_scale(std, action_dim))
+
+    def forward(self, observation: Tensor, injection: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, ``(*B, A)``, from a state ``(*B, S)`` and an injection ``(*B, H)``."""
+        loc = self.output(self.body(torch.relu(self.input(observation) + injection)))
+        return loc, self.scale.expand_as(loc)

@@ -1,0 +1,59 @@
+"""Encoders of the latent space model: from goals to distributions over skills."""
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from torchrl_mcp.modules.gating import relu_mlp
+
+
+class StateGoalEncoder(nn.Module):
+    r"""The encoder of a transfer task, :math:`q(w|s, g) = \mathcal{N}(\mu_q(s, g), \mathrm{diag}(\sigma_q^2(s, g)))`.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        latent_dim: Size of the latent variable, ``L``.
+        num_cells: Hidden units.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self, observation_dim: int, goal_dim: int, latent_dim: int, *, num_cells: Sequence[int] = (1024, 512)
+    ) -> None:
+        super().__init__()
+        self.body = relu_mlp(observation_dim + goal_dim, num_cells)
+        self.output = nn.Linear(num_cells[-1], 2 * latent_dim)
+
+    def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, each ``(*B, L)``, from a state ``(*B, S)`` and a goal ``(*B, G)``."""
+        return self._gaussian(observation, goal)
+
+    def _gaussian(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        loc, log_scale = self.output(self.body(*inputs)).float().chunk(2, dim=-1)
+        return loc, log_scale.exp()
+
+
+class GoalEncoder(StateGoalEncoder):
+    r"""The encoder of pre-training, :math:`q(w|g)`, which does not look at the state.
+
+    Args:
+        observation_dim: Size of the state, which is not used.
+        goal_dim: Size of the goal, ``G``.
+        latent_dim: Size of the latent variable, ``L``.
+        num_cells: Hidden units.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self, observation_dim: int, goal_dim: int, latent_dim: int, *, num_cells: Sequence[int] = (256, 128)
+    ) -> None:
+        super().__init__(0, goal_dim, latent_dim, num_cells=num_cells)
+
+    def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, each ``(*B, L)``, from a goal ``(*B, G)`` alone."""
+        return self._gaussian(goal)

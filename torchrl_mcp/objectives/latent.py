@@ -1,0 +1,73 @@
+"""PPO's loss with the latent space model's regulariser."""
+
+from typing import Any
+
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torch.distributions import Distribution
+
+from torchrl_mcp.latent import ENCODING
+from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
+
+
+class LatentPPOLoss(BoundedClipPPOLoss):
+    r"""The bounded PPO loss plus a penalty on codes that say much about the goal.
+
+    .. math:: L + \beta \, \mathbb{E} \, D_{KL}\left[ q(w|g) \,\|\, \mathcal{N}(0, I) \right]
+
+    The paper's Eq. 12 maximises return *plus* this divergence, which would reward its growth; a regulariser is
+    subtracted from the return, hence added to the loss. Eq. 12 is stated for policy and encoder together, which is
+    pre-training, but Table 11 gives one :math:`\beta` without the distinction of stages that it makes for step sizes:
+    here it acts in both, on :math:`q(w|s, g)` at transfer.
+
+    Args:
+        actor_network: The policy, of :func:`torchrl_mcp.latent.latent_actor`.
+        critic_network: The value function.
+        kl_coeff: Weight of the penalty, :math:`\beta`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Eq. 12. https://arxiv.org/abs/1905.09808
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        *,
+        kl_coeff: float,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(actor_network, critic_network, **kwargs)
+        self.kl_coeff = kl_coeff
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add ``loss_latent`` to the terms of the bounded loss, and report the divergence as ``latent_kl`` in nats."""
+        out = super().forward(tensordict)
+        kl = standard_normal_kl(*self._encoding).mean()
+        del self._encoding
+        return out.set("loss_latent", self.kl_coeff * kl).set("latent_kl", kl.detach())
+
+    def _get_cur_log_prob(
+        self, tensordict: TensorDictBase, params: TensorDictParams | None = None
+    ) -> tuple[Tensor, Distribution, bool]:
+        outcome = super()._get_cur_log_prob(tensordict, params)
+        # The networks have just written what they computed.
+        self._encoding = [tensordict[key] for key in ENCODING]
+        return outcome
+
+
+def standard_normal_kl(loc: Tensor, scale: Tensor) -> Tensor:
+    r"""Return the divergence of diagonal Gaussians from the standard normal distribution.
+
+    .. math:: D_{KL} = \sum_i \frac{\mu_i^2 + \sigma_i^2 - 1}{2} - \log \sigma_i
+
+    Args:
+        loc: Means, shape ``(*B, L)``.
+        scale: Standard deviations, shape ``(*B, L)``.
+
+    Returns:
+        Divergences in nats, shape ``(*B,)``.
+    """
+    return ((loc.square() + scale.square() - 1) / 2 - scale.log()).sum(-1)

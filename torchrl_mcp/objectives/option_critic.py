@@ -1,0 +1,220 @@
+"""What the option-critic estimates from trajectories, and what it minimises."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import GAE
+
+from torchrl_mcp.options import EpsilonGreedy, of_option
+
+
+class OptionAdvantages:
+    r"""Advantages of actions and of terminations, and targets for the values of options.
+
+    .. math::
+        \delta_t &= r_t + \gamma U(\omega_t, s_{t+1}) - Q_\Omega(s_t, \omega_t) \\
+        A_t &= \delta_t + \gamma \lambda A_{t+1} \\
+        U(\omega, s') &= Q_\Omega(s', \omega) - \beta_\omega(s') A_\Omega(s', \omega), \qquad
+        A_\Omega(s', \omega) = Q_\Omega(s', \omega) - V_\Omega(s') \\
+        V_\Omega(s) &= \sum_\omega \pi_\Omega(\omega|s) Q_\Omega(s, \omega)
+
+    Actions are judged by :math:`A_t`, values regress to :math:`Q_\Omega(s_t, \omega_t) + A_t`, and the termination of
+    an option in the state where it led is judged by :math:`A_\Omega(s_{t+1}, \omega_t) + \xi`. With
+    :math:`\lambda = 0` these are the one-step estimates of Bacon et al. An episode that terminated has no value beyond
+    its end and no option to end; one that is cut off by a time limit or the end of the batch goes on.
+
+    Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`; the termination
+    advantage is in units of the reward itself, in which :math:`\xi` is given.
+
+    Args:
+        critic: From ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
+        gamma: Discount factor.
+        lmbda: Decay of the estimators.
+        clip: Largest absolute advantage of an action after normalisation to zero mean and unit variance.
+        epsilon: Probability of a random choice in the policy over options, :math:`\pi_\Omega`.
+        termination_cost: :math:`\xi`, which keeps options from ending at every step.
+
+    Reference:
+        Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017. https://arxiv.org/abs/1609.05140
+    """
+
+    out_keys = ("advantage", "value_target", "termination_advantage", ("next", "observation"))
+
+    def __init__(
+        self,
+        critic: TensorDictModuleBase,
+        *,
+        gamma: float,
+        lmbda: float,
+        clip: float,
+        epsilon: float,
+        termination_cost: float,
+    ) -> None:
+        self.critic = critic
+        self.reward_scale, self.clip = 1 - gamma, clip
+        self.epsilon, self.termination_cost = epsilon, termination_cost
+        self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Add the estimates, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
+        option = batch["option"]
+        values, terminations = self._criticised(batch)
+        cut = batch["next", "truncated"].squeeze(-1).clone()
+        cut[:, -1] = True
+        arrived_values, arrived_terminations = values.roll(-1, dims=1), terminations.roll(-1, dims=1)
+        arrived_values[cut], arrived_terminations[cut] = self._criticised(batch["next"][cut])
+        kept = of_option(arrived_values, option)
+        chosen = (EpsilonGreedy(arrived_values, self.epsilon).probs * arrived_values).sum(-1, keepdim=True)
+
+        trajectories = batch.select(("next", "done"), ("next", "terminated"))
+        trajectories["state_value"] = of_option(values, option)
+        trajectories["next", "state_value"] = kept - of_option(arrived_terminations, option) * (kept - chosen)
+        trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
+        self.gae(trajectories)
+
+        advantage = trajectories["advantage"]
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
+        batch["advantage"] = advantage.clamp(-self.clip, self.clip)
+        batch["value_target"] = trajectories["value_target"]
+        regret = (kept - chosen) / self.reward_scale + self.termination_cost
+        batch["termination_advantage"] = regret * ~batch["next", "terminated"]
+        return batch
+
+    def _criticised(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Values and terminations of all options, each ``(*B, K)``."""
+        criticised = self.critic(states.select("observation", "goal"))
+        return criticised["option_values"].float(), criticised["terminations"].float()
+
+
+class OptionCriticLoss(LossModule):
+    r"""The updates of the option-critic, as one loss.
+
+    .. math::
+        L = -\mathbb{E} \min(\rho A, \operatorname{clip}(\rho, 1 - \epsilon, 1 + \epsilon) A)
+        + \mathbb{E} \, \beta_\omega(s') (A_\Omega(s', \omega) + \xi)
+        + \tfrac{1}{2} \mathbb{E} (Q_\Omega(s, \omega) - y)^2
+        + c \, \mathbb{E} \sum_j \max(0, |\mu_j| - b)^2
+
+    with :math:`\rho = \pi_\omega(a|s) / \pi_\omega^{\mathrm{old}}(a|s)`. Samples that are used once have
+    :math:`\rho = 1`, and the gradients of the first three terms are those of the intra-option policy gradient theorem,
+    of the termination gradient theorem and of intra-option Q-learning; the clipped ratio lets samples be used several
+    times. Where the options are frozen, the third term is all that there is.
+
+    Args:
+        actor_network: From a sample to the distribution of ``action``, and to ``termination``,
+            :math:`\beta_\omega(s')`.
+        critic_network: From ``observation`` and ``goal`` to ``option_values``.
+        clip_epsilon: :math:`\epsilon`.
+        bound_coeff: Weight of the penalty on means out of bounds, :math:`c`; 0 for distributions without a mean.
+        bound: Largest absolute mean action, :math:`b`.
+
+    Reference:
+        Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017, Theorems 1 and 2 and Algorithm 1.
+        https://arxiv.org/abs/1609.05140
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes."""
+
+        action: NestedKey = "action"
+        sample_log_prob: NestedKey = "action_log_prob"
+        option: NestedKey = "option"
+        option_values: NestedKey = "option_values"
+        termination: NestedKey = "termination"
+        advantage: NestedKey = "advantage"
+        termination_advantage: NestedKey = "termination_advantage"
+        value_target: NestedKey = "value_target"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        *,
+        clip_epsilon: float,
+        bound_coeff: float,
+        bound: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.actor_network, self.critic_network = actor_network, critic_network
+        self.clip_epsilon, self.bound_coeff, self.bound = clip_epsilon, bound_coeff, bound
+
+    @property
+    def functional(self) -> bool:
+        """Whether parameters are held apart from the networks: they are not."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of a sample that the loss reads."""
+        keys = self.tensor_keys
+        estimates = [keys.sample_log_prob, keys.option, keys.advantage, keys.termination_advantage, keys.value_target]
+        networks = [*self.actor_network.in_keys, *self.critic_network.in_keys]
+        return list(dict.fromkeys([keys.action, *networks, *estimates]))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys of what the loss returns."""
+        if not self._learns_options():
+            return ["loss_critic"]
+        losses = ["loss_critic", "loss_objective", "loss_termination", "loss_bound"]
+        return [*losses, "kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the terms of the loss, and what they say of the update, as scalars."""
+        terms = {"loss_critic": self._critic_loss(tensordict)}
+        if self._learns_options():
+            terms |= self._option_losses(tensordict)
+        return TensorDict(terms)
+
+    def _critic_loss(self, tensordict: TensorDictBase) -> Tensor:
+        keys = self.tensor_keys
+        values = self.critic_network(tensordict.select(*self.critic_network.in_keys))[keys.option_values]
+        error = of_option(values, tensordict[keys.option]) - tensordict[keys.value_target]
+        return error.square().mean() / 2
+
+    def _option_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        keys = self.tensor_keys
+        outputs = self.actor_network.get_dist_params(tensordict.select(*self.actor_network.in_keys))
+        distribution = self.actor_network.build_dist_from_params(outputs)
+        log_ratio = distribution.log_prob(tensordict[keys.action]) - tensordict[keys.sample_log_prob]
+        ratio, advantage = log_ratio.exp(), tensordict[keys.advantage].squeeze(-1)
+        clipped = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
+        regret = tensordict[keys.termination_advantage].squeeze(-1)
+        return {
+            "loss_objective": -torch.minimum(ratio * advantage, clipped * advantage).mean(),
+            "loss_termination": (outputs[keys.termination] * regret).mean(),
+            "loss_bound": self._bound_penalty(distribution, advantage),
+            **_update_report(log_ratio.detach(), self.clip_epsilon),
+        }
+
+    def _bound_penalty(self, distribution: Any, like: Tensor) -> Tensor:
+        if not self.bound_coeff:
+            return like.new_zeros(())
+        excess = (distribution.mean.abs() - self.bound).relu()
+        return self.bound_coeff * excess.square().sum(-1).mean()
+
+    def _learns_options(self) -> bool:
+        return any(parameter.requires_grad for parameter in self.actor_network.parameters())
+
+
+def _update_report(log_ratio: Tensor, clip_epsilon: float) -> dict[str, Tensor]:
+    """How far the policy has gone from the one that drew the samples, as TorchRL's PPO loss tells it."""
+    ratio = log_ratio.exp()
+    return {
+        "kl_approx": -log_ratio.mean(),
+        "clip_fraction": ((ratio - 1).abs() > clip_epsilon).float().mean(),
+        "mean_ratio": ratio.mean(),
+        "max_ratio": ratio.max(),
+        "ESS": ratio.sum().square() / ratio.square().sum() / ratio.numel(),
+    }

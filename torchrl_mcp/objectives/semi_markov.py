@@ -1,0 +1,85 @@
+"""Advantages of choices that last for several steps."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+
+class SemiMarkovAdvantages:
+    r"""GAE(:math:`\lambda`) and TD(:math:`\lambda`) targets for choices, from the steps that they took.
+
+    A choice in state s that lasts k steps, the last of which leads to s', has the advantage
+
+    .. math::
+        A = \sum_{i=0}^{k-1} \gamma^i r_i + \gamma^k V(s') - V(s) + \gamma^k \lambda A'
+
+    where :math:`A'` is the advantage of the choice that follows. A terminated episode has no value beyond its end.
+    After a time limit and at the end of the batch no choice follows, and V of the state that was reached counts,
+    whether or not the choice would have lasted longer; a batch should be long against a choice.
+
+    Steps before the first choice of a batch belong to one of the batch before, and teach nothing.
+
+    Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`.
+
+    Args:
+        critic: From ``observation`` and ``goal`` to ``state_value``.
+        gamma: Discount factor of one step.
+        lmbda: Decay of both estimators, from choice to choice.
+        clip: Largest absolute advantage after normalisation to zero mean and unit variance.
+
+    Reference:
+        Sutton, Precup and Singh, *Between MDPs and semi-MDPs: A framework for temporal abstraction in reinforcement
+        learning*, 1999. https://doi.org/10.1016/S0004-3702(99)00052-1
+    """
+
+    out_keys = ("advantage", "value_target", "state_value")
+
+    def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
+        self.critic, self.gamma, self.lmbda, self.clip = critic, gamma, lmbda, clip
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the C choices of trajectories ``(N, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        begins = batch["begins"]
+        if not begins.any():
+            raise ValueError(
+                f"no choice was made in {batch.shape[1]} steps: training.frames_per_batch / training.num_envs must be "
+                "at least the steps that a choice lasts"
+            )
+        value = torch.zeros(batch.shape, device=begins.device)
+        value[begins] = self._values(batch[begins])
+        target = self._targets(batch, value)
+
+        choices = batch[begins]
+        advantage = (target - value)[begins]
+        advantage = (advantage - advantage.mean()) / advantage.std(correction=0).clamp_min(1e-8)
+        choices["advantage"] = advantage.clamp(-self.clip, self.clip).unsqueeze(-1)
+        choices["value_target"] = target[begins].unsqueeze(-1)
+        choices["state_value"] = value[begins].unsqueeze(-1)
+        return choices
+
+    def _targets(self, batch: TensorDictBase, value: Tensor) -> Tensor:
+        r"""TD(:math:`\lambda`) returns from every step, ``(N, T)``, given the values where choices begin."""
+        terminated, truncated = (batch["next", key].squeeze(-1) for key in ("terminated", "truncated"))
+        stops = terminated | truncated
+        stops[:, -1] = True
+        cut = stops & ~terminated
+        next_value = value.roll(-1, dims=1).masked_fill(terminated, 0.0)
+        next_value[cut] = self._values(batch["next"][cut])
+        lmbda = self.lmbda * (~stops).float()
+        ends = stops | batch["begins"].roll(-1, dims=1)
+        reward = (1 - self.gamma) * batch["next", "reward"].squeeze(-1)
+        target = torch.empty_like(value)
+        later = torch.zeros_like(value[:, 0])
+        for t in reversed(range(batch.shape[1])):
+            after = torch.where(ends[:, t], torch.lerp(next_value[:, t], later, lmbda[:, t]), later)
+            target[:, t] = later = reward[:, t] + self.gamma * after
+        return target
+
+    def _values(self, states: TensorDictBase) -> Tensor:
+        return self.critic(states.select("observation", "goal"))["state_value"].squeeze(-1).float()
