@@ -4,9 +4,9 @@
     python benchmarks/heading.py --report             # trains nothing
 
 Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for as many steps as
-``CHARACTERS`` says. Run folders are in ``--output``; a run that was stopped goes on. The report plays one episode of 20 s in each of
-``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
-film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
+``CHARACTERS`` says. Run folders are in ``--output``; a run that was stopped goes on. The report plays one episode of
+20 s in each of ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and
+``.svg``, and a film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
 """
 
 import argparse
@@ -99,7 +99,7 @@ def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
     cost = {"frames": int(last["frames"]), "training_seconds": round(last["seconds"])}
     machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
     for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
-        del numbers["measures"]
+        del numbers["measures"], numbers["diagnostics"]
         yield facts | cost | {"mode": mode} | numbers | machine
 
 

@@ -96,7 +96,7 @@ def learn(folder: Path, name: str, seed: int) -> None:
     contender = CONTENDERS[name]
     settings = ["stage=transfer", *contender.settings, f"training.total_frames={contender.steps}"]
     if contender.mixer:
-        settings.append(f"checkpoint={folder / f'pretrain-{contender.mixer}-{seed}'}")
+        settings.append(f"pretrained={folder / f'pretrain-{contender.mixer}-{seed}'}")
     train(folder / f"{name}-{seed}", [*settings, f"seed={seed}"])
 
 
@@ -142,6 +142,8 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
     """Return the numbers of a run, deterministic and stochastic."""
     contender, run = CONTENDERS[name], folder / f"{name}-{seed}"
     numbers = experiment.evaluate_run(run, episodes=episodes, seed=12345)
+    for values in numbers.values():
+        del values["measures"], values["diagnostics"]
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
     facts = {"contender": name, "label": contender.label, "seed": seed, "frames": contender.steps, "preset": "fast"}
     machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}

@@ -3,7 +3,7 @@
 Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, for as
 many steps as ``CHARACTERS`` says. Run again, the script goes on where it stopped. It writes learning curves, returns
 with changing references, the tracking of every clip and films to ``benchmarks/results``, and with ``--publish`` the
-networks that come with the library to ``torchrl_mcp/pretrained``.
+networks that come with the library to ``torchrl_mcp/networks``.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp import checkpoint, experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.builtin import FOLDER
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CHARACTERS = {"biped": 12_000_000, "humanoid": 12_000_000, "trex": 12_000_000}
@@ -50,7 +51,7 @@ def main() -> None:
     report(runs, arguments.episodes, arguments.episodes_per_clip)
     if arguments.publish:
         for character, run in runs.items():
-            experiment.publish(run, experiment.BUILTIN / f"mcp-{character}.torchrl")
+            experiment.publish_run(run, FOLDER / f"mcp-{character}.torchrl")
 
 
 def train(run: Path, character: str) -> None:
@@ -69,6 +70,7 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     for character, run in runs.items():
         for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
             measures = numbers.pop("measures")
+            del numbers["diagnostics"]
             completed = 1 - numbers.pop("terminated")
             row = {"character": character, "mode": mode, "completed": completed, **facts[character], **numbers}
             rows.append(row | {"tracking_error": measures["tracking_error"], "machine": platform.machine()})

@@ -1,6 +1,6 @@
 """Environment steps per second of every task with every character, beside bare MuJoCo in the same scene.
 
-    python benchmarks/task_throughput.py            # ten minutes, writes results/task_throughput.csv
+    python benchmarks/task_throughput.py            # a quarter of an hour, writes results/task_throughput.csv
     python benchmarks/task_throughput.py --quick    # seconds, writes nothing unless given --output
 
 ``raw`` is ``mujoco.batch`` with the scene's model and as many physics steps per action, kinematics brought up to date
@@ -26,14 +26,17 @@ from typing import Any
 
 import mujoco
 import torch
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
 from mujoco.batch import Batch
 from training_throughput import about, table, write
 
 from torchrl_mcp import envs
 
 RESULTS = Path(__file__).resolve().parent / "results" / "task_throughput.csv"
-TASKS, SIZES = ("Heading", "Carry", "Dribble"), (256, 1024)
+TASKS, SIZES = ("Heading", "Carry", "Dribble", "Imitation"), (256, 1024)
 AIM = 0.9
+PLACES = ("qpos", "qvel", "mocap_pos", "mocap_quat")
 SUNKEN = 0.5
 """Share of its height at rest below which the root of a character has sunk."""
 
@@ -44,12 +47,26 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1024
 
 
+def make(task: str, character: str, **kwargs: Any) -> envs.PDCharacterEnv:
+    """Environments of a task; imitation follows the generated corpus with the reward of its configuration."""
+    if task != "Imitation":
+        return getattr(envs, task)(character=character, **kwargs)
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        cfg = compose("train", ["task=imitation", f"character={character}"])
+    return instantiate(cfg.task.pretrain)(**kwargs)
+
+
 def raw(env: envs.PDCharacterEnv, script: torch.Tensor, threads: int) -> Callable[[int], None]:
     """A step of MuJoCo alone in the scene of ``env``."""
     model = env.simulation.model
     batch = Batch(model, env.num_envs, threads, True)
     batch.reset()
-    ctrl, qpos = batch.bind("ctrl"), batch.bind("qpos")
+    env.reset()
+    start = {key: value.numpy() for key, value in env.get_state().items() if key in PLACES}
+    places = {key: batch.bind(key) for key in start}
+    for key, value in start.items():
+        places[key][:] = value
+    ctrl, qpos = batch.bind("ctrl"), places["qpos"]
     controls = (script.double() * torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5])).numpy()
 
     def step(index: int) -> None:
@@ -58,6 +75,8 @@ def raw(env: envs.PDCharacterEnv, script: torch.Tensor, threads: int) -> Callabl
         sunken = (qpos[:, 2] < SUNKEN * model.qpos0[2]).nonzero()[0]
         if len(sunken):
             batch.reset(sunken, stage=mujoco.mjtStage.mjSTAGE_NONE)
+            for key, value in start.items():
+                places[key][sunken] = value[sunken]
 
     return step
 
@@ -76,10 +95,10 @@ def ours(env: envs.PDCharacterEnv, script: torch.Tensor) -> Callable[[int], None
 def measure(task: str, character: str, num_envs: int, turns: int, steps: int, threads: int) -> dict[str, Any]:
     """Let bare MuJoCo and the task take turns."""
     torch.set_num_threads(1)
-    getattr(envs, task)(character=character, num_envs=1).reset()
+    make(task, character, num_envs=1).reset()
     gc.collect()
     before = resident()
-    env = getattr(envs, task)(character=character, num_envs=num_envs, seed=0, num_threads=threads)
+    env = make(task, character, num_envs=num_envs, seed=0, num_threads=threads)
     generator = torch.Generator().manual_seed(0)
     script = torch.rand(32, *env.action_spec.shape, generator=generator) * 0.6 - 0.3
     contender = ours(env, script)

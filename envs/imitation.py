@@ -1,7 +1,7 @@
 """Motion imitation: the task from which primitives are pre-trained."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -82,6 +82,8 @@ class Imitation(PDCharacterEnv):
         Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
         section 4, https://arxiv.org/abs/1905.09808
     """
+
+    _next: PlacedMotion  # where the references are after the next step
 
     def __init__(
         self,
@@ -182,10 +184,11 @@ class Imitation(PDCharacterEnv):
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         angle, place = self.heading(ids), self._positions[ids, 0]
         targets = self._look_ahead(ids)
+        placement = cast("Placement", targets.placement)
         # Seen from the character, a reference looks as its clip does from where it would be there.
         ground = place * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
-        origin = targets.placement.inverse().points(ground.repeat(NUM_TARGETS, 1))
-        turn = angle.repeat(NUM_TARGETS) - targets.placement.turn
+        origin = placement.inverse().points(ground.repeat(NUM_TARGETS, 1))
+        turn = angle.repeat(NUM_TARGETS) - placement.turn
         dtype = targets.moment.qpos.dtype
         goal = bodies_in_heading_frame(turn.to(dtype), origin.to(dtype), targets.moment.bodies)
         return {

@@ -172,6 +172,17 @@ def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
     assert summary(outcome, lambda returns: returns)["measures"] == pytest.approx(expected)
 
 
+def test_what_the_policy_wrote_in_every_step_of_every_episode_is_recorded():
+    writer = TensorDictModule(
+        lambda observation, goal: (torch.zeros_like(observation), observation.squeeze(-1)),
+        ["observation", "goal"],
+        ["action", "seen"],
+    )
+    decisions = evaluate(writer, Countdown([1, 3]), record=["seen"]).decisions
+    assert sorted(decisions["seen"].tolist()) == [0, 0, 1, 2]  # steps before each: of the first, none; of the second
+    assert "action" not in decisions.keys()  # noqa: SIM118
+
+
 def test_a_summary_of_four_episodes_by_hand():
     outcome = episodes([0.0, 2.0, 4.0, 6.0], [1, 2, 3, 10], [True, False, False, False])
     numbers = summary(outcome, lambda returns: returns / 10)

@@ -70,8 +70,8 @@ def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run
         (["stage.gama=0.9"], "stage.gamma"),
         (["task=holdot"], "holdout"),
         (["method=mpc"], "mcp"),
-        (["stage=transfer"], "checkpoint=<folder>"),
-        (["stage=transfer", "checkpoint=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
+        (["stage=transfer"], "pretrained=<folder>"),
+        (["stage=transfer", "pretrained=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
         (["exploration=weights"], "stage=transfer"),
         (["resume=nowhere"], "nowhere holds no run"),
         (["training.minibatch_size=100"], "multiple"),
@@ -96,7 +96,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(run)
 
 
 def test_transfer_from_another_architecture_is_refused(run, tmp_path):
-    outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"checkpoint={run}", cwd=tmp_path)
+    outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
     assert outcome.returncode != 0
     assert "different method, character, task or network size" in outcome.stderr
     assert list(tmp_path.iterdir()) == []

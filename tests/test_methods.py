@@ -59,7 +59,7 @@ def runs(request, tmp_path_factory):
     pretrained = experiment.train(
         configure(folder / "pretrain", method, "stage=pretrain", "autocast=false", *pretraining)
     )
-    return pretrained, experiment.train(configure(folder / "transfer", *transfer, f"checkpoint={pretrained}"))
+    return pretrained, experiment.train(configure(folder / "transfer", *transfer, f"pretrained={pretrained}"))
 
 
 def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_freeze(runs):
@@ -91,6 +91,13 @@ def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs):
         assert 1 <= numbers["length"] <= 5
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
     assert results["deterministic"]["return"] != results["stochastic"]["return"]
+    cfg, _, _ = experiment.restore(runs[1], num_envs=1, seed=0)
+    chosen = {"mcp": "gates/effective_primitives", "moe": "gates/effective_primitives"}
+    chosen |= dict.fromkeys(("hierarchical", "option_critic"), "options/effective_options")
+    if name := chosen.get(cfg.method.name):
+        assert 1 <= results["stochastic"]["diagnostics"][name] <= 8 + 1e-4
+    else:
+        assert results["stochastic"]["diagnostics"] == {}
 
 
 def test_before_an_update_the_loss_sees_the_policy_that_collected(runs):

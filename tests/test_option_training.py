@@ -73,7 +73,7 @@ def test_an_interrupted_run_continues_with_the_option_that_was_held(tmp_path, mo
     settings = ["training.total_frames=384", "training.num_epochs=1"]
     if method == "hierarchical":
         # Batches of 32 steps and choices of 20: every batch but the first begins in the middle of one.
-        settings += ["stage=transfer", "character=biped", "task=heading", f"checkpoint={pretrained[method]}"]
+        settings += ["stage=transfer", "character=biped", "task=heading", f"pretrained={pretrained[method]}"]
         settings += ["batch_factor=1", "steps_per_choice=20"]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     experiment.train(configure(whole, method, *settings))
@@ -89,7 +89,7 @@ def test_an_interrupted_run_continues_with_the_option_that_was_held(tmp_path, mo
 
 def test_transfer_of_options_trains_their_values_alone(tmp_path, pretrained):
     folder = tmp_path / "run"
-    settings = ["stage=transfer", f"checkpoint={pretrained['option_critic']}", "training.total_frames=256"]
+    settings = ["stage=transfer", f"pretrained={pretrained['option_critic']}", "training.total_frames=256"]
     experiment.train(configure(folder, "option_critic", *settings))
     before, after = final_parts(pretrained["option_critic"]), final_parts(folder)
     kept = ("options", "terminations", "observation_normaliser")
@@ -120,7 +120,7 @@ def test_environments_follow_one_clip_of_seven_each_to_the_end_of_an_episode():
 
 def test_the_gate_learns_from_choices_and_environment_steps_are_counted(tmp_path, pretrained):
     folder = tmp_path / "run"
-    settings = ["stage=transfer", "character=biped", "task=heading", f"checkpoint={pretrained['hierarchical']}"]
+    settings = ["stage=transfer", "character=biped", "task=heading", f"pretrained={pretrained['hierarchical']}"]
     settings += ["training.num_epochs=1"]
     experiment.train(configure(folder, "hierarchical", *settings))
     (row,) = rows(folder)

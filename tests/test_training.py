@@ -79,7 +79,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pre
 @pytest.mark.parametrize("exploration", ["action", "weights"])
 def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path, pretrained, exploration):
     folder = tmp_path / exploration
-    experiment.train(configure(folder, "stage=transfer", f"exploration={exploration}", f"checkpoint={pretrained}"))
+    experiment.train(configure(folder, "stage=transfer", f"exploration={exploration}", f"pretrained={pretrained}"))
     before, after = final_parts(pretrained), final_parts(folder)
     for name in before:
         kept = name.startswith(("primitives", "observation_normaliser"))
@@ -90,7 +90,7 @@ def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path
 
 
 def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, pretrained):
-    settings = ["stage=transfer", f"checkpoint={pretrained}", "transfer.freeze=[]"]
+    settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]"]
     start = experiment.make_agent(
         cfg := configure(tmp_path / "run", *settings),
         experiment.make_env(cfg, num_envs=1, seed=0),
@@ -128,7 +128,7 @@ def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_go
 
 
 def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypatch):
-    cfg = configure(tmp_path / "run", "stage=transfer", f"checkpoint={pretrained}")
+    cfg = configure(tmp_path / "run", "stage=transfer", f"pretrained={pretrained}")
     real = experiment.Trainer._update_normalisers
 
     def meddle(trainer, batch):

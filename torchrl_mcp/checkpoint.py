@@ -62,6 +62,16 @@ def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None
     load(run_checkpoint(nn.ModuleDict({name: parts[name] for name in names})), path)
 
 
+def load_agent(parts: nn.ModuleDict, path: Path) -> None:
+    """Restore all parts of an agent from the checkpoint file ``path``, but for a critic that the file does not hold.
+
+    Raises:
+        ValueError: As :func:`load`.
+    """
+    held = _manifest(path)["components"]
+    load_parts(parts, [name for name in parts if name != "critic" or _component(name) in held], path)
+
+
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
     """Return the checkpoints of a run folder, of which the newest ``keep_last`` stay."""
     return CheckpointRotation(run / FOLDER, keep_last=keep_last)
@@ -87,10 +97,18 @@ def configuration(path: Path) -> Mapping[str, Any]:
     Raises:
         ValueError: If the file is not a checkpoint of this library.
     """
+    return _manifest(path)["metadata"]["config"]
+
+
+def _manifest(path: Path) -> Mapping[str, Any]:
+    """Return what the checkpoint file ``path`` says of itself."""
     try:
-        return Checkpoint.manifest(path)["metadata"]["config"]
+        manifest = Checkpoint.manifest(path)
+        if "config" in manifest["metadata"]:
+            return manifest
     except UNREADABLE as error:
         raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: {error}") from error
+    raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: it holds no configuration")
 
 
 def _require_plain_data(path: Path) -> None:

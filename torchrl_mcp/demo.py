@@ -90,7 +90,7 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     """
     began = time.monotonic()
     runs = {name: configuration(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
-    runs["transfer"].checkpoint = runs["pretrain"].run_dir
+    runs["transfer"].pretrained = runs["pretrain"].run_dir
     require_early_checkpoint(runs)
     print(f"Working in {folder}. Interrupt it when you like: called again, it goes on from there.", flush=True)
     show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
@@ -276,7 +276,7 @@ def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]
 def _settings(cfg: DictConfig | ListConfig) -> dict[str, Any]:
     """All that makes a run what it is, wherever it lies."""
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    return {key: value for key, value in settings.items() if key not in ("run_dir", "checkpoint")}
+    return {key: value for key, value in settings.items() if key not in ("run_dir", "pretrained")}
 
 
 def _steps(cfg: DictConfig) -> int:

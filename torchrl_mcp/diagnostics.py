@@ -6,13 +6,15 @@ from torchrl_mcp.actors import Actor
 from torchrl_mcp.modules import gate_diagnostics
 from torchrl_mcp.options import OptionActor, option_diagnostics
 
-
 DIAGNOSED = ("gates", "option", "begins")
+
+COLLAPSED = 1.1
+"""Effective number of options up to which one of them does everything."""
 
 
 def diagnosed(actor: Actor) -> list[str]:
     """Return the keys that :func:`diagnostics` reads of what an actor writes."""
-    return [key for key in DIAGNOSED if key in actor.policy.out_keys]
+    return [key for key in DIAGNOSED if key in actor.stored]
 
 
 def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:

@@ -2,10 +2,12 @@
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from torchrl_mcp.diagnostics import COLLAPSED
 from torchrl_mcp.experiment import evaluate_clips, evaluate_run
 
 
@@ -36,6 +38,8 @@ def main() -> None:
         )
         for name, value in numbers["diagnostics"].items():
             print(f"    {name:26} {value:.3f}")
+        if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
+            print("    the options have collapsed: one of them acts almost always")
     if clips:
         print(f"  {'clip':28} seconds  completed  tracking error  length")
     for clip in clips:
@@ -44,8 +48,8 @@ def main() -> None:
             f"{clip.length:6.0f}"
         )
     if arguments.output:
-        results |= {"clips": [asdict(clip) for clip in clips]} if clips else {}
-        arguments.output.write_text(json.dumps(results, indent=2) + "\n")
+        numbers = results | ({"clips": [asdict(clip) for clip in clips]} if clips else {})
+        arguments.output.write_text(json.dumps(numbers, indent=2) + "\n")
 
 
 if __name__ == "__main__":

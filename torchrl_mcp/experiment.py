@@ -17,6 +17,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl_mcp import checkpoint
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.analysis.imitation import ClipResult, follow_each
+from torchrl_mcp.builtin import builtin, publish
 from torchrl_mcp.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation import evaluate, summary
@@ -47,7 +48,7 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
     if cfg.stage.name not in cfg.task:
         raise ValueError(
             f"task={cfg.task.name} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
-            f"task={cfg.task.name} with stage=transfer and checkpoint=<folder of the pre-training>"
+            f"task={cfg.task.name} with stage=transfer and pretrained=<folder of the pre-training>"
         )
     env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
     if not (transforms := instantiate(cfg.get("transforms", []))):
@@ -150,7 +151,8 @@ def restore(
     """Return configuration, trained agent and fresh environments from a run folder or checkpoint file.
 
     Args:
-        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file. What is published holds no critic,
+            which is then as it was initialised.
         num_envs: Number of environments.
         seed: Their seed.
         device: Where to put the networks.
@@ -164,8 +166,24 @@ def restore(
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
     agent = make_agent(cfg, env)
-    checkpoint.load_parts(agent.parts, list(agent.parts), file)
+    checkpoint.load_agent(agent.parts, file)
     return cfg, agent, env
+
+
+def publish_run(path: Path, output: Path) -> None:
+    """Write the policy of a run as a checkpoint file of its own, as small as those that come with the library.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        output: The file to write.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    cfg, agent, _ = restore(path, num_envs=1, seed=0)
+    cfg.run_dir = cfg.run_root = "runs"  # where it lay is of no use to others
+    parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
+    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output)
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
@@ -229,9 +247,11 @@ def _pretrained(cfg: DictConfig) -> Path | None:
     """Return the checkpoint file to transfer from, or None where nothing is transferred."""
     if cfg.stage.name != "transfer" or not cfg.transfer.keep:
         return None
-    if cfg.checkpoint is None:
+    if cfg.pretrained is None:
         raise ValueError(
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
-            "give its run folder as checkpoint=<folder>"
+            "give its run folder as pretrained=<folder>"
         )
-    return checkpoint.find(Path(cfg.checkpoint))
+    if cfg.pretrained == "builtin":
+        return builtin(cfg.method.name, cfg.character.name)
+    return checkpoint.find(Path(cfg.pretrained))

@@ -34,55 +34,60 @@ class PlacedMotion:
 
     Args:
         moment: N moments.
-        placement: N turns and shifts.
+        placement: N turns and shifts, or None to leave them where they are.
     """
 
-    def __init__(self, moment: MotionState, placement: Placement) -> None:
+    def __init__(self, moment: MotionState, placement: Placement | None) -> None:
         self.moment, self.placement = moment, placement
-        self._each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
+        if placement is not None:
+            self._each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
 
     @cached_property
     def qpos(self) -> Tensor:
         """States of the character, shape ``(N, nq)``."""
-        return self.placement.qpos(self.moment.qpos)
+        return self.moment.qpos if self.placement is None else self.placement.qpos(self.moment.qpos)
 
     @cached_property
     def qvel(self) -> Tensor:
         """Their velocities in MuJoCo's convention, shape ``(N, nv)``."""
-        return self.placement.qvel(self.moment.qvel)
+        return self.moment.qvel if self.placement is None else self.placement.qvel(self.moment.qvel)
 
     @cached_property
     def positions(self) -> Tensor:
         """Of the bodies, shape ``(N, L, 3)``."""
-        return self._each.points(self.moment.bodies.positions)
+        positions = self.moment.bodies.positions
+        return positions if self.placement is None else self._each.points(positions)
 
     @cached_property
     def orientations(self) -> Tensor:
         """Of the bodies, unit quaternions, shape ``(N, L, 4)``."""
-        return self._each.quaternions(self.moment.bodies.orientations)
+        orientations = self.moment.bodies.orientations
+        return orientations if self.placement is None else self._each.quaternions(orientations)
 
     @cached_property
     def bodies(self) -> BodyStates:
         """All of the bodies, in the world."""
         velocities = (self.moment.bodies.linear_velocities, self.moment.bodies.angular_velocities)
-        return BodyStates(self.positions, self.orientations, *map(self._each.vectors, velocities))
+        if self.placement is not None:
+            velocities = (self._each.vectors(velocities[0]), self._each.vectors(velocities[1]))
+        return BodyStates(self.positions, self.orientations, *velocities)
 
     def __getitem__(self, index: slice) -> "PlacedMotion":
         """Some of the moments."""
         return self._of([part[index] for part in self._parts()])
 
     def replaced(self, ids: Tensor, others: "PlacedMotion") -> "PlacedMotion":
-        """Return these moments with ``others`` in the rows ``ids``."""
+        """Return these moments with ``others`` in the rows ``ids``; both are carried somewhere, or neither is."""
         pairs = zip(self._parts(), others._parts(), strict=True)
         return self._of([part.index_copy(0, ids, other) for part, other in pairs])
 
     def _parts(self) -> list[Tensor]:
-        return [self.moment.qpos, self.moment.qvel, *self.moment.bodies, *self.placement]
+        return [self.moment.qpos, self.moment.qvel, *self.moment.bodies, *(self.placement or ())]
 
     @classmethod
     def _of(cls, parts: list[Tensor]) -> "PlacedMotion":
-        qpos, qvel, *bodies = parts[:-2]
-        return cls(MotionState(qpos, qvel, BodyStates(*bodies)), Placement(*parts[-2:]))
+        qpos, qvel, *bodies = parts[:6]
+        return cls(MotionState(qpos, qvel, BodyStates(*bodies)), Placement(*parts[6:]) if parts[6:] else None)
 
 
 class MotionLibrary:
@@ -158,10 +163,9 @@ class MotionLibrary:
         orientations = quaternions[..., self._num_turns :].mT
         positions, linear, angular = (part.unflatten(-1, (3, -1)).mT for part in moments[2:5])
         state = MotionState(qpos, moments[5], BodyStates(positions, orientations, linear, angular))
-        if placement is None:
-            placement = Placement(torch.zeros_like(frames), frames.new_zeros(len(clips), 2))
         if cycles.any():
-            placement = placement.after(Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles))
+            cycle = Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles)
+            placement = cycle if placement is None else placement.after(cycle)
         return PlacedMotion(state, placement)
 
     def sample(self, num: int, generator: torch.Generator, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
