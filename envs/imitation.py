@@ -71,6 +71,8 @@ class Imitation(PDCharacterEnv):
         terms: Weight and scale of each error in the reward, by name.
         max_error: Largest mean distance of bodies from the reference, in metres.
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
+            another reference, so that every episode lasts until its time limit or a failure.
         failure_weighting: :math:`\alpha`, from 0 to 1.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
@@ -94,6 +96,7 @@ class Imitation(PDCharacterEnv):
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
+        clip_end: str = "truncate",
         failure_weighting: float = 0.0,
         max_episode_steps: int = 300,
         **kwargs: Any,
@@ -106,7 +109,9 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"failure_weighting={failure_weighting} is out of range: pass 0 (none) to 1")
         if not switch_interval > 0:
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
-        self.library, self.max_error = library, max_error
+        if clip_end not in ("truncate", "switch"):
+            raise ValueError(f"clip_end={clip_end!r} is unknown: pass 'truncate' or 'switch'")
+        self.library, self.max_error, self.clip_end = library, max_error, clip_end
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
@@ -224,8 +229,10 @@ class Imitation(PDCharacterEnv):
 
     def _switch(self) -> None:
         """Give some characters another reference, beginning where they are and facing as they do."""
-        chance = torch.rand(self.num_envs, generator=self.generator)
-        ids = (chance < self.switch_probability).nonzero().squeeze(-1)
+        changes = torch.rand(self.num_envs, generator=self.generator) < self.switch_probability
+        if self.clip_end == "switch":
+            changes |= self._ended()
+        ids = changes.nonzero().squeeze(-1)
         if not len(ids):
             return
         clips, times = self._draw(len(ids))
@@ -271,6 +278,10 @@ class Imitation(PDCharacterEnv):
         return masses @ places / masses.sum()
 
     def _exhausted(self) -> Tensor:
+        return (self._ended() & (self.clip_end == "truncate")).unsqueeze(-1)
+
+    def _ended(self) -> Tensor:
+        """Whether clips end before the last target that would be shown next, ``(N,)``."""
         clips = self.episode["clip"]
         ahead = self.episode["time"] + NUM_TARGETS * CONTROL_TIMESTEP
-        return ((ahead > self.library.durations[clips]) & ~self.library.loops[clips]).unsqueeze(-1)
+        return (ahead > self.library.durations[clips]) & ~self.library.loops[clips]

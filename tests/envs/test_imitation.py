@@ -149,6 +149,18 @@ def test_the_end_of_a_clip_truncates_and_the_end_of_a_cycle_does_not():
         assert ends[13] == (not loop, False)  # the goal looks two steps beyond the 14th of 15
 
 
+def test_the_end_of_a_clip_may_lead_to_another_reference_instead():
+    clips = {"short": gliding("biped", seconds=1.0)}
+    env = make(num_envs=16, clips=clips, clip_end="switch", max_error=10.0, terminate_on_fall=False)
+    state = env.reset()
+    for _ in range(60):
+        state = idle(env, state)
+        assert not state["done"].any()
+    assert (env.episode["time"] <= 1.0).all()
+    with pytest.raises(ValueError, match="clip_end='loop' is unknown"):
+        make(clip_end="loop")
+
+
 def test_a_new_reference_begins_where_the_character_is_and_faces():
     clips = {"turn": gliding("biped", turn=TURN), "other": gliding("biped", turn=-TURN)}
     env = make(num_envs=256, clips=clips, switch_interval=0.5)
