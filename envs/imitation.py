@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.difficulty import Difficulty
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import joint_layout
 from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
@@ -32,9 +33,6 @@ ERRORS = (
 )
 """Respects in which a character differs from its reference, of which the terms of the reward are made."""
 
-MEMORY = 0.9997
-"""Share of the counts of steps and failures that remains after a control step: they reach back about 100 s."""
-
 
 class Imitation(PDCharacterEnv):
     r"""A character follows reference motions, which change in the middle of an episode.
@@ -57,12 +55,8 @@ class Imitation(PDCharacterEnv):
     further than ``max_error`` from the reference. The end of a clip that does not loop truncates it, as the time limit
     does, and the value of what would follow counts.
 
-    With ``failure_weighting`` :math:`\alpha`, references are drawn more often the more often they are lost:
-
-    .. math:: P(c) \propto W_c \left(1 - \alpha + \alpha \, \lambda_c / \bar{\lambda}\right)
-
-    where :math:`W_c` is the weight of clip :math:`c` in the library, :math:`\lambda_c` the recent share of its steps
-    that ended an episode, and :math:`\bar{\lambda}` the mean of these over clips by weight.
+    With probability ``failure_weighting`` a moment is drawn where episodes end often, see
+    :class:`~torchrl_mcp.envs.difficulty.Difficulty`, and else evenly.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -73,7 +67,7 @@ class Imitation(PDCharacterEnv):
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
-        failure_weighting: :math:`\alpha`, from 0 to 1.
+        failure_weighting: Probability from 0 to 1.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -115,7 +109,7 @@ class Imitation(PDCharacterEnv):
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
-        self._steps = self._failures = torch.ones(len(library), dtype=torch.float64)
+        self._difficulty = Difficulty(library)
         self._layout, names = joint_layout(character), library.body_names
         self._keys = [names.index(body) for body in CHARACTERS[character].key_bodies]
         reference = {
@@ -161,30 +155,25 @@ class Imitation(PDCharacterEnv):
         }
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See :meth:`CharacterEnv.get_extra_state`; and how often each clip was followed and lost."""
-        return {**super().get_extra_state(), "steps": self._steps, "failures": self._failures}
+        """See :meth:`CharacterEnv.get_extra_state`; and where references are lost."""
+        return {**super().get_extra_state(), "difficulty": self._difficulty.state_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         super().set_extra_state(state)
-        self._steps, self._failures = state["steps"].clone(), state["failures"].clone()
+        self._difficulty.load_state_dict(state["difficulty"])
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
 
     def _draw(self, num: int) -> tuple[Tensor, Tensor]:
-        """Draw moments of clips, the difficult ones more often."""
-        weights, share = self.library.weights, self.failure_weighting
-        if share:
-            rate = self._failures / self._steps
-            weights = weights * (1 - share + share * rate * weights.sum() / (weights @ rate))
-        return self.library.sample(num, self.generator, weights)
-
-    def _remember(self, ended: Tensor) -> None:
-        """Count steps and failures of each clip, and let old ones fade."""
-        clips = self.episode["clip"]
-        steps, failures = (torch.bincount(chosen, minlength=len(self.library)) for chosen in (clips, clips[ended]))
-        self._steps, self._failures = MEMORY * self._steps + steps, MEMORY * self._failures + failures
+        """Draw moments of clips."""
+        clips, times = self.library.sample(num, self.generator)
+        if not self.failure_weighting:
+            return clips, times
+        hard = torch.rand(num, generator=self.generator) < self.failure_weighting
+        others = self._difficulty.draw(num, self.generator)
+        return torch.where(hard, others[0], clips), torch.where(hard, others[1], times)
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         angle, place = self.heading(ids), self._positions[ids, 0]
@@ -223,7 +212,7 @@ class Imitation(PDCharacterEnv):
         reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
         ended = fallen | lost
         if self.failure_weighting:
-            self._remember(ended)
+            self._difficulty.count(self.episode["clip"], self.episode["time"], ended)
         self._switch()
         return reward.masked_fill(lost, 0.0), ended
 

@@ -180,31 +180,33 @@ def test_a_new_reference_begins_where_the_character_is_and_faces():
     assert not during["terminated"].any()
 
 
-def test_lost_references_come_back_more_often():
-    clips = {"still": gliding("biped", loop=True), "shifted": gliding("biped", turn=TURN, loop=True)}
-    env = make(num_envs=1000, clips=clips, failure_weighting=0.8)
+def test_where_references_are_lost_they_come_back_more_often():
+    clips = {"still": gliding("biped", loop=True), "other": gliding("biped", seconds=3.0)}
+    env = make(num_envs=3000, clips=clips, failure_weighting=0.6)
     env.reset()
-    assert (env.get_state()["clip"] == 0).float().mean().item() == pytest.approx(0.5, abs=0.08)
-    # The second has failed three times as often as the first: rates 1 : 3, mean 2, weights 0.2 + 0.8 x (0.5, 1.5).
-    env._steps, env._failures = torch.tensor([100.0, 300.0]).double(), torch.tensor([10.0, 90.0]).double()
+    assert (env.episode["clip"] == 0).double().mean().item() == pytest.approx(2 / 5, abs=0.04)
+    difficulty = env._difficulty
+    for step in range(2000):  # seconds 0 and 1 of the first, 0 to 2 of the second, whose last is lost every fifth time
+        clip, time = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0.5, 7.5, 0.5, 1.5, 2.5]).double()
+        difficulty.count(clip, time, torch.tensor([False, False, False, False, step % 5 == 0]))
     env.reset()
-    assert (env.get_state()["clip"] == 0).float().mean().item() == pytest.approx(0.6 / 2.0, abs=0.07)
+    hard = (env.episode["clip"] == 1) & (env.episode["time"] >= 1.0)
+    assert hard.double().mean().item() == pytest.approx(0.4 * 2 / 5 + 0.6 * 0.95, abs=0.06)
 
 
-def test_failures_are_counted_by_clip_and_survive_a_checkpoint():
+def test_failures_are_counted_by_the_second_and_survive_a_checkpoint():
     clips = {"still": gliding("biped", loop=True), "other": gliding("biped", turn=TURN, loop=True)}
     env, copy = (make(num_envs=4, clips=clips, failure_weighting=1.0, max_error=0.3) for _ in range(2))
     env.reset()
     state = env.get_state()
-    state["clip"] = torch.tensor([0, 1, 1, 1])
-    state["qpos"][1:3, 1] += 1.0  # two of the second clip are lost
+    state["clip"], state["time"] = torch.tensor([0, 1, 1, 1]), torch.tensor([0.2, 0.2, 1.2, 3.2]).double()
+    state["qpos"][:, 1] += 10.0  # all are lost
     idle(env, env.reset(state, set_state=True))
-    steps, failures = env._steps, env._failures
-    torch.testing.assert_close(steps, torch.tensor([2.0, 4.0]).double(), atol=1e-3, rtol=0)
-    torch.testing.assert_close(failures, torch.tensor([1.0, 3.0]).double(), atol=1e-3, rtol=0)
+    failures = env._difficulty.failures
+    torch.testing.assert_close(failures, torch.tensor([2.0, 1.0, 2.0, 3.0]).double(), atol=1e-2, rtol=0)
     copy.load_state_dict(env.state_dict())
-    assert torch.equal(copy._failures, failures)
-    assert torch.equal(copy._steps, steps)
+    assert torch.equal(copy._difficulty.failures, failures)
+    assert torch.equal(copy._difficulty.steps, env._difficulty.steps)
 
 
 def test_the_terms_of_the_reward_are_told():
