@@ -67,7 +67,7 @@ class Imitation(PDCharacterEnv):
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
-        failure_weighting: Probability from 0 to 1.
+        failure_weighting: Probability with which a moment is drawn where episodes end often rather than evenly.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
