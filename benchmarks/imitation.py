@@ -1,9 +1,9 @@
 """Pre-training by imitation: how well do the primitives of MCP learn to follow reference motions?
 
-Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, for as
-many steps as ``CHARACTERS`` says. Run again, the script goes on where it stopped. It writes learning curves, returns
-with changing references, the tracking of every clip and films to ``benchmarks/results``, and with ``--publish`` the
-networks that come with the library to ``torchrl_mcp/networks``.
+Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, in the
+``PHASES`` given for it: until so many steps, with these settings of the task. Run again, the script goes on where it
+stopped. It writes learning curves, returns with changing references, the tracking of every clip and films to
+``benchmarks/results``, and with ``--publish`` the networks that come with the library to ``torchrl_mcp/networks``.
 """
 
 import argparse
@@ -12,12 +12,13 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from omegaconf import OmegaConf
 from PIL import Image
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -27,7 +28,12 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.builtin import FOLDER
 
 RESULTS = Path(__file__).resolve().parent / "results"
-CHARACTERS = {"biped": 12_000_000, "humanoid": 12_000_000, "trex": 12_000_000}
+LOST, CHANGING = {"failure_weighting": 0.5}, {"switch_interval": 1.5}
+PHASES: dict[str, list[tuple[int, dict[str, float]]]] = {
+    "biped": [(4_505_600, {}), (0, LOST), (0, CHANGING)],
+    "humanoid": [(3_686_400, {}), (0, LOST), (0, CHANGING)],
+    "trex": [(3_276_800, {})],
+}
 COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
 EVALUATION_SEED = 12345
@@ -37,7 +43,7 @@ def main() -> None:
     """Train what is missing, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--output", type=Path, default=Path("runs/imitation"), help="folder of the run folders")
-    parser.add_argument("--characters", nargs="+", default=list(CHARACTERS), choices=CHARACTERS)
+    parser.add_argument("--characters", nargs="+", default=list(PHASES), choices=PHASES)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
     parser.add_argument("--report", action="store_true", help="train nothing: report the runs as far as they are")
     parser.add_argument("--publish", action="store_true", help="write the networks that come with the library, too")
@@ -56,11 +62,24 @@ def main() -> None:
 
 def train(run: Path, character: str) -> None:
     """Train a character in a process of its own, or go on where a former one stopped."""
-    settings = [f"character={character}", f"training.total_frames={CHARACTERS[character]}", f"run_dir={run}"]
-    begun = (run / experiment.CONFIG).exists()
-    arguments = [f"resume={run}"] if begun else [*COMMON, *MACHINE, *settings]
-    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
-    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    for steps, settings in PHASES[character]:
+        if (run / experiment.CONFIG).exists():
+            set_phase(run, steps, settings)
+            arguments = [f"resume={run}"]
+        else:
+            phase = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
+            arguments = [*COMMON, *MACHINE, *phase]
+        command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+        subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
+def set_phase(run: Path, steps: int, settings: Mapping[str, float]) -> None:
+    """Let the run in a folder go on until so many steps, with other settings of its task."""
+    cfg = OmegaConf.load(run / experiment.CONFIG)
+    cfg.training.total_frames = steps
+    cfg.imitation.update(settings)
+    cfg.task.pretrain.update(settings)
+    OmegaConf.save(cfg, run / experiment.CONFIG)
 
 
 def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None:
