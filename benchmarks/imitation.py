@@ -30,13 +30,14 @@ from torchrl_mcp.builtin import FOLDER
 RESULTS = Path(__file__).resolve().parent / "results"
 LOST, CHANGING = {"failure_weighting": 0.5}, {"switch_interval": 1.5}
 PHASES: dict[str, list[tuple[int, dict[str, float]]]] = {
-    "biped": [(4_505_600, {}), (0, LOST), (0, CHANGING)],
-    "humanoid": [(3_686_400, {}), (0, LOST), (0, CHANGING)],
+    "biped": [(4_505_600, {}), (6_348_800, LOST), (7_987_200, CHANGING)],
+    "humanoid": [(3_686_400, {}), (5_120_000, LOST), (6_553_600, CHANGING)],
     "trex": [(3_276_800, {})],
 }
 COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
 EVALUATION_SEED = 12345
+EVALUATION = {"clip_end": "switch", "switch_interval": 5.0}
 
 
 def main() -> None:
@@ -88,7 +89,7 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     rows, clips = [], []
     for character, run in runs.items():
         # Every episode shall last 10 s, so that completing one means the same everywhere.
-        evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, clip_end="switch")
+        evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **EVALUATION)
         for mode, numbers in evaluation.items():
             measures = numbers.pop("measures")
             del numbers["diagnostics"]
