@@ -32,7 +32,7 @@ LOST, CHANGING = {"failure_weighting": 0.5}, {"switch_interval": 1.5}
 PHASES: dict[str, list[tuple[int, dict[str, float]]]] = {
     "biped": [(4_505_600, {}), (6_348_800, LOST), (7_987_200, CHANGING)],
     "humanoid": [(3_686_400, {}), (5_120_000, LOST), (6_553_600, CHANGING)],
-    "trex": [(3_276_800, {})],
+    "trex": [(4_096_000, {})],
 }
 COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
