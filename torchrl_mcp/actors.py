@@ -102,8 +102,7 @@ def composite_parts(
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "gating": gating(observation_dim, goal_dim, num_primitives),
             "primitives": primitives(
                 observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
@@ -131,8 +130,7 @@ def gaussian_parts(
     """
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "policy": policy(observation_dim, goal_dim, action_dim),
         }
     )
@@ -225,6 +223,19 @@ def gaussian_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Act
         sampler("action", IndependentNormal, loc="loc", scale="scale"),
     )
     return Actor(policy, policy)
+
+
+def input_normalisers(
+    observation_dim: int, goal_dim: int, normaliser: Callable[[int], RunningNormaliser]
+) -> dict[str, nn.Module]:
+    """Make the parts that :func:`normalise_inputs` needs.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        normaliser: Makes an input normaliser from a size.
+    """
+    return {"observation_normaliser": normaliser(observation_dim), "goal_normaliser": normaliser(goal_dim)}
 
 
 def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:

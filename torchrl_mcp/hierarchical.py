@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.actors import GOAL, STATE, normalise_inputs, sampler
+from torchrl_mcp.actors import GOAL, STATE, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 from torchrl_mcp.options import OptionActor, WhereBeginning, keep_option
 
@@ -33,8 +33,7 @@ def primitive_parts(
     """
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "primitives": primitives(observation_dim, action_dim, num_options),
         }
     )

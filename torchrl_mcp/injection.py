@@ -25,7 +25,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.actors import GOAL, STATE, Actor, normalise_inputs, sampler
+from torchrl_mcp.actors import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.injection import InjectedPolicy, InputInjection
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
@@ -52,8 +52,7 @@ def injected_parts(
     network = policy(observation_dim, action_dim)
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "policy": network,
             "goal_input": InputInjection(goal_dim, network.input.out_features).requires_grad_(not blind),
         }

@@ -25,7 +25,7 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.actors import GOAL, STATE, Actor, normalise_inputs, sampler
+from torchrl_mcp.actors import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 NOISE = ("latent", "noise")
@@ -61,8 +61,7 @@ def latent_parts(
         raise ValueError(f"latent_dim must be at least 1, got {latent_dim}")
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "encoder": encoder(observation_dim, goal_dim, latent_dim),
             "decoder": decoder(observation_dim, latent_dim, action_dim),
         }

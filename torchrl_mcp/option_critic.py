@@ -27,7 +27,7 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal
 
-from torchrl_mcp.actors import GOAL, PRIMITIVES, STATE, normalise_inputs, sampler
+from torchrl_mcp.actors import GOAL, PRIMITIVES, STATE, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 from torchrl_mcp.options import EpsilonGreedy, OptionActor, WhereBeginning, keep_option, of_option
 
@@ -59,8 +59,7 @@ def option_critic_parts(
     """
     return nn.ModuleDict(
         {
-            "observation_normaliser": normaliser(observation_dim),
-            "goal_normaliser": normaliser(goal_dim),
+            **input_normalisers(observation_dim, goal_dim, normaliser),
             "options": options(observation_dim, action_dim, num_options),
             "terminations": terminations(observation_dim, num_options),
             "critic": MLP(
