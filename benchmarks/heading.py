@@ -20,12 +20,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
-from PIL import Image
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp import experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.analysis.films import save_film
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CHARACTERS = {"biped": 4_000_000, "humanoid": 3_000_000, "trex": 1_000_000}
@@ -81,9 +80,8 @@ def report(runs: dict[str, Path], episodes: int) -> None:
     write_curves(curves, RESULTS / "heading_curves.csv")
     save_figure(draw_curves(curves), RESULTS / "heading_curves")
     for character, run in runs.items():
-        first, *others = film(run)
-        path = RESULTS / f"heading_{character}.gif"
-        first.save(path, save_all=True, append_images=others, duration=1000 / 15, loop=0)
+        _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+        save_film(agent.actor.policy, env, RESULTS / f"heading_{character}.gif")
     for row in rows:
         print(
             f"{row['character']} {row['mode']}: {row['normalised_return']:.3f} +- {row['normalised_return_std']:.3f}, "
@@ -101,21 +99,6 @@ def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
     for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
         del numbers["measures"], numbers["diagnostics"]
         yield facts | cost | {"mode": mode} | numbers | machine
-
-
-@torch.no_grad()
-def film(run: Path, seconds: float = 8.0) -> Iterator[Image.Image]:
-    """Yield pictures of the deterministic policy, 15 per second."""
-    _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
-    state = env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for step in range(round(30 * seconds)):
-            action = agent.actor.policy(state.select("observation", "goal"))["action"]
-            _, state = env.step_and_maybe_reset(state.set("action", action))
-            if step % 2:
-                picture = Image.fromarray(env.render(width=320, height=240, distance=3.5).numpy())
-                yield picture.quantize(64)
-    env.close()
 
 
 if __name__ == "__main__":

@@ -12,19 +12,17 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
 from omegaconf import OmegaConf
-from PIL import Image
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp import checkpoint, experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.analysis.films import save_film
 from torchrl_mcp.builtin import FOLDER
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -105,9 +103,8 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     write_curves(curves, RESULTS / "imitation_curves.csv")
     save_figure(draw_curves(curves, ylabel="control steps per episode"), RESULTS / "imitation_curves")
     for character, run in runs.items():
-        first, *others = film(run)
-        path = RESULTS / f"imitation_{character}.gif"
-        first.save(path, save_all=True, append_images=others, duration=1000 / 15, loop=0)
+        _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+        save_film(agent.actor.policy, env, RESULTS / f"imitation_{character}.gif")
 
 
 def cost(run: Path) -> dict[str, float]:
@@ -123,21 +120,6 @@ def write_table(rows: list[dict], path: Path) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-
-
-@torch.no_grad()
-def film(run: Path, seconds: float = 8.0) -> Iterator[Image.Image]:
-    """Yield pictures of the deterministic policy, 15 per second."""
-    _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
-    state = env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for step in range(round(30 * seconds)):
-            action = agent.actor.policy(state.select("observation", "goal"))["action"]
-            _, state = env.step_and_maybe_reset(state.set("action", action))
-            if step % 2:
-                picture = Image.fromarray(env.render(width=320, height=240, distance=3.5).numpy())
-                yield picture.quantize(64)
-    env.close()
 
 
 if __name__ == "__main__":
