@@ -1,0 +1,31 @@
+import pytest
+
+
+@pytest.fixture(scope="session")
+def human_bands() -> dict[str, tuple[float, float]]:
+    """Of measured walking at 1 m/s, in metres and degrees: means of subjects and the spread between them."""
+    return {
+        "step_width": (0.06, 0.16),
+        "stance": (0.62, 0.67),
+        "double_support": (0.25, 0.34),
+        "sway": (0.02, 0.055),
+        "thigh_forward": (26, 36),
+        "thigh_back": (-29, -8),
+        "knee_strike": (0, 10),
+        "knee_loading": (6, 25),
+        "knee_stance": (0, 12),
+        "knee_swing": (65, 77),
+        "ankle_dorsiflexion": (13, 24),
+        "ankle_plantarflexion": (-25, -4),
+        "pitch_strike": (15, 26),
+        "pitch_toe_off": (-80, -62),
+        "pelvis_yaw": (4, 15),
+        "pelvis_list": (6, 14),
+        "shoulder_yaw": (2, 11),
+        "trunk_roll": (2, 8),
+        "toe_clearance": (0.085, 0.115),
+        "slide": (0, 0.03),
+        "arm_swing": (24, 46),
+        "elbow_mean": (15, 34),
+        "elbow_swing": (18, 50),
+    }
