@@ -16,7 +16,7 @@ from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
-from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_rewards
+from torchrl_mcp.envs.tracking import Term, mismatch, squared_angles, squared_distances, tracking_rewards
 
 NUM_TARGETS = 2
 """States of the reference that the goal shows ahead (section 4)."""
@@ -39,10 +39,11 @@ class Imitation(PDCharacterEnv):
 
     An episode begins at a random moment of a random clip, in the reference's own state. With probability
     :math:`\Delta t /` ``switch_interval`` per step the reference becomes another random moment, brought to where the
-    character is and faces. ``goal`` (2 x 13 L) holds, for the next two steps, the positions of the L bodies of the
-    reference relative to the ground below the character, their orientations and velocities, in its heading frame.
-    ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in metres, and
-    ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
+    character is and faces: of ``switch_candidates`` moments the one whose bodies are most like the character's, by
+    :func:`~torchrl_mcp.envs.tracking.mismatch`. ``goal`` (2 x 13 L) holds, for the next two steps, the positions of
+    the L bodies of the reference relative to the ground below the character, their orientations and velocities, in its
+    heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in
+    metres, and ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
 
     The reward is the sum of :func:`~torchrl_mcp.envs.tracking.tracking_rewards` of these errors: ``pose``, the mean
     squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
@@ -65,6 +66,8 @@ class Imitation(PDCharacterEnv):
         terms: Weight and scale of each error in the reward, by name.
         max_error: Largest mean distance of bodies from the reference, in metres.
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        switch_candidates: Number of random moments of which the most similar becomes the reference: 1 asks for motions
+            that no body can go over to, as from a fast walk to standing, and with more of them changes become easier.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
         failure_weighting: Probability with which a moment is drawn where episodes end often rather than evenly.
@@ -90,6 +93,7 @@ class Imitation(PDCharacterEnv):
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
+        switch_candidates: int = 1,
         clip_end: str = "truncate",
         failure_weighting: float = 0.0,
         max_episode_steps: int = 300,
@@ -103,10 +107,13 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"failure_weighting={failure_weighting} is out of range: pass 0 (none) to 1")
         if not switch_interval > 0:
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
+        if switch_candidates < 1:
+            raise ValueError(f"switch_candidates={switch_candidates} is out of range: pass at least 1")
         if clip_end not in ("truncate", "switch"):
             raise ValueError(f"clip_end={clip_end!r} is unknown: pass 'truncate' or 'switch'")
         self.library, self.max_error, self.clip_end = library, max_error, clip_end
         self.terms = {name: Term(**term) for name, term in terms.items()}
+        self.switch_candidates = switch_candidates
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
         self._difficulty = Difficulty(library)
@@ -217,18 +224,22 @@ class Imitation(PDCharacterEnv):
         return reward.masked_fill(lost, 0.0), ended
 
     def _switch(self) -> None:
-        """Give some characters another reference, beginning where they are and facing as they do."""
+        """Give some characters another reference, like what they do, where they are and facing as they do."""
         changes = torch.rand(self.num_envs, generator=self.generator) < self.switch_probability
         if self.clip_end == "switch":
             changes |= self._ended()
         ids = changes.nonzero().squeeze(-1)
         if not len(ids):
             return
-        clips, times = self._draw(len(ids))
-        placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][ids])
+        each = ids.repeat(self.switch_candidates)
+        clips, times = self._draw(len(each))
+        placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][each])
+        references = self.library.at(clips, times, placement)
+        best = mismatch(self._body_states(each), references.bodies).view(-1, len(ids)).argmin(0)
+        chosen = best * len(ids) + torch.arange(len(ids))
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
-        for key, value in changed.items():
-            self.episode[key][ids] = value
+        for key, values in changed.items():
+            self.episode[key][ids] = values[chosen]
 
     def _error(self, name: str, reference: PlacedMotion) -> Tensor:
         """How far the character is from the reference in one respect, one of ``ERRORS``, ``(N,)``."""

@@ -6,6 +6,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.motions.kinematics import BodyStates
+
+HORIZON = 0.25
+"""Seconds after which a difference of velocities has become one of places."""
+
 
 class Term(NamedTuple):
     r"""A term of the imitation reward, :math:`w \exp(-c \, e)` of an error :math:`e`."""
@@ -50,3 +55,20 @@ def squared_angles(one: Tensor, other: Tensor) -> Tensor:
 def squared_distances(one: Tensor, other: Tensor) -> Tensor:
     """Squared distances between points, shape ``(*B, D)`` each, to ``(*B)``."""
     return (one - other).square().sum(-1)
+
+
+def mismatch(one: BodyStates, other: BodyStates) -> Tensor:
+    r"""How unlike two moments are: the mean squared distance of bodies, and what that of their velocities makes of it.
+
+    .. math:: \frac{1}{L} \sum_l |x_l - \hat{x}_l|^2 + \tau^2 |v_l - \hat{v}_l|^2, \quad \tau = 0.25 \text{ s}
+
+    Args:
+        one: L bodies, each field ``(*B, L, ...)``.
+        other: The same bodies at another moment.
+
+    Returns:
+        Shape ``(*B)``, in square metres.
+    """
+    places = squared_distances(one.positions, other.positions)
+    velocities = squared_distances(one.linear_velocities, other.linear_velocities)
+    return (places + HORIZON**2 * velocities).mean(-1)

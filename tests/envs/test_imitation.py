@@ -180,6 +180,23 @@ def test_a_new_reference_begins_where_the_character_is_and_faces():
     assert not during["terminated"].any()
 
 
+def test_of_several_candidates_the_most_similar_becomes_the_reference():
+    clips = {"turn": gliding("biped", turn=TURN), "other": gliding("biped", turn=-TURN)}
+    found = {}
+    for candidates in (1, 64):
+        env = make(num_envs=256, clips=clips, switch_candidates=candidates)
+        env.reset()
+        clip = env.episode["clip"].clone()
+        env.switch_probability = 1.0
+        env._switch()
+        # Nothing but the turn tells the clips apart, and everything else is alike all along.
+        found[candidates] = (env.episode["clip"] == clip).double().mean().item()
+    assert found[1] == pytest.approx(0.5, abs=0.13)
+    assert found[64] == 1.0
+    with pytest.raises(ValueError, match="switch_candidates=0"):
+        make(switch_candidates=0)
+
+
 def test_where_references_are_lost_they_come_back_more_often():
     clips = {"still": gliding("biped", loop=True), "other": gliding("biped", seconds=3.0)}
     env = make(num_envs=3000, clips=clips, failure_weighting=0.6)

@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.tracking import Term, squared_angles, squared_distances, tracking_rewards
+from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.tracking import Term, mismatch, squared_angles, squared_distances, tracking_rewards
 
 
 def test_the_terms_of_the_reward_are_weighted_exponentials():
@@ -32,3 +33,11 @@ def test_small_angles_keep_their_gradient():
 
 def test_squared_distances_are_over_the_last_dimension():
     assert squared_distances(torch.tensor([[1.0, 2.0], [0.0, 3.0]]), torch.zeros(2)).tolist() == [5.0, 9.0]
+
+
+def test_moments_differ_by_where_bodies_are_and_soon_will_be():
+    still = BodyStates(torch.zeros(3, 2, 3), torch.zeros(3, 2, 4), torch.zeros(3, 2, 3), torch.zeros(3, 2, 3))
+    places = torch.tensor([[[0.3, 0.4, 0.0], [0.0, 0.0, 0.0]]]).expand(3, 2, 3)
+    velocities = torch.tensor([[[0.0, 0.0, 4.0], [0.0, 0.0, 0.0]]]) * torch.tensor([0.0, 1.0, 2.0]).view(3, 1, 1)
+    other = still._replace(positions=places, linear_velocities=velocities)
+    torch.testing.assert_close(mismatch(still, other), torch.tensor([0.125, 0.625, 2.125]))
