@@ -68,6 +68,8 @@ class Imitation(PDCharacterEnv):
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
         switch_candidates: Number of random moments of which the most similar becomes the reference: 1 asks for motions
             that no body can go over to, as from a fast walk to standing, and with more of them changes become easier.
+        switch_to: ``"any"`` clip, or the ``"same"``, which brings a reference back to a character that has drifted off
+            and cannot see it.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
         failure_weighting: Probability with which a moment is drawn where episodes end often rather than evenly.
@@ -94,6 +96,7 @@ class Imitation(PDCharacterEnv):
         max_error: float = 0.3,
         switch_interval: float = 5.0,
         switch_candidates: int = 1,
+        switch_to: str = "any",
         clip_end: str = "truncate",
         failure_weighting: float = 0.0,
         max_episode_steps: int = 300,
@@ -109,11 +112,13 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
         if switch_candidates < 1:
             raise ValueError(f"switch_candidates={switch_candidates} is out of range: pass at least 1")
+        if switch_to not in ("any", "same"):
+            raise ValueError(f"switch_to={switch_to!r} is unknown: pass 'any' or 'same'")
         if clip_end not in ("truncate", "switch"):
             raise ValueError(f"clip_end={clip_end!r} is unknown: pass 'truncate' or 'switch'")
         self.library, self.max_error, self.clip_end = library, max_error, clip_end
         self.terms = {name: Term(**term) for name, term in terms.items()}
-        self.switch_candidates = switch_candidates
+        self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
         self._difficulty = Difficulty(library)
@@ -173,8 +178,10 @@ class Imitation(PDCharacterEnv):
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
 
-    def _draw(self, num: int) -> tuple[Tensor, Tensor]:
-        """Draw moments of clips."""
+    def _draw(self, num: int, clips: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Draw moments, of the clips if these are given."""
+        if clips is not None:
+            return clips, torch.rand(num, generator=self.generator, dtype=torch.float64) * self.library.durations[clips]
         clips, times = self.library.sample(num, self.generator)
         if not self.failure_weighting:
             return clips, times
@@ -232,7 +239,7 @@ class Imitation(PDCharacterEnv):
         if not len(ids):
             return
         each = ids.repeat(self.switch_candidates)
-        clips, times = self._draw(len(each))
+        clips, times = self._draw(len(each), self.episode["clip"][each] if self.switch_to == "same" else None)
         placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][each])
         references = self.library.at(clips, times, placement)
         best = mismatch(self._body_states(each), references.bodies).view(-1, len(ids)).argmin(0)

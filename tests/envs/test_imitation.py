@@ -197,6 +197,22 @@ def test_of_several_candidates_the_most_similar_becomes_the_reference():
         make(switch_candidates=0)
 
 
+def test_a_reference_may_stay_the_same_and_come_back_to_the_character():
+    clips = {"turn": gliding("biped", turn=TURN, loop=True), "other": gliding("biped", turn=-TURN, loop=True)}
+    env = make(num_envs=64, clips=clips, switch_to="same", max_error=10.0, terminate_on_fall=False)
+    state = env.reset()
+    for _ in range(30):
+        state = idle(env, state)
+    assert state["tracking_error"].min() > 0.2
+    clip = env.episode["clip"].clone()
+    env.switch_probability = 1.0
+    idle(env, state)
+    assert torch.equal(env.episode["clip"], clip)
+    torch.testing.assert_close(reference_of(env).qpos[:, :2], env.get_state()["qpos"][:, :2])
+    with pytest.raises(ValueError, match="switch_to='other' is unknown"):
+        make(switch_to="other")
+
+
 def test_where_references_are_lost_they_come_back_more_often():
     clips = {"still": gliding("biped", loop=True), "other": gliding("biped", seconds=3.0)}
     env = make(num_envs=3000, clips=clips, failure_weighting=0.6)
