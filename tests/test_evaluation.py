@@ -229,3 +229,9 @@ def test_the_summary_repeats_and_leaves_the_global_generator_alone():
 
 def test_equal_episodes_have_an_interval_without_width():
     assert summary(episodes([3.0] * 10), lambda x: x)["interval"] == [3.0, 3.0]
+
+
+def test_a_single_episode_has_no_spread():
+    numbers = summary(episodes([3.0]), lambda x: x)
+    assert (numbers["normalised_return"], numbers["normalised_return_std"]) == (3.0, 0.0)
+    assert numbers["interval"] == [3.0, 3.0]

@@ -81,6 +81,23 @@ def test_wherever_a_kill_cuts_the_file_a_continued_run_writes_a_whole_one(tmp_pa
         assert file.read_bytes() == whole, cut
 
 
+def test_a_kill_while_rewinding_loses_no_row(tmp_path, monkeypatch):
+    fill(tmp_path, range(1, 13))
+    before = table(tmp_path)
+
+    def killed(self, rows):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("csv.DictWriter.writerows", killed)
+        with pytest.raises(KeyboardInterrupt):
+            Record(tmp_path).rewind(10)
+    assert table(tmp_path) == before
+    Record(tmp_path).rewind(10)
+    assert table(tmp_path) == before[:10]
+    assert [file.name for file in tmp_path.iterdir()] == ["metrics.csv"]
+
+
 def test_a_header_that_a_kill_cut_short_is_written_anew(tmp_path):
     fill(tmp_path, [1, 2])
     file = tmp_path / "metrics.csv"

@@ -102,8 +102,8 @@ def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], 
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``measures``), the standard deviation over episodes, and a 95 % percentile bootstrap interval of the
-        mean.
+        fraction, ``measures``), the standard deviation over episodes (0 of a single one), and a 95 % percentile
+        bootstrap interval of the mean.
     """
     normalised = normalised_return(outcome.returns)
     generator = torch.Generator().manual_seed(0)
@@ -111,7 +111,7 @@ def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], 
     low, high = normalised[index].mean(1).quantile(torch.tensor([0.025, 0.975])).tolist()
     return {
         "normalised_return": normalised.mean().item(),
-        "normalised_return_std": normalised.std().item(),
+        "normalised_return_std": normalised.std(correction=min(1, len(normalised) - 1)).item(),
         "interval": [low, high],
         "return": outcome.returns.mean().item(),
         "length": outcome.lengths.float().mean().item(),

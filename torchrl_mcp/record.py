@@ -42,8 +42,10 @@ class Record:
             kept = [row for row in rows if None not in row.values() and int(row["iteration"]) <= iteration]
         # Without rows the header may be cut short as well: the next row writes it anew.
         self._columns = list(kept[0]) if kept else []
-        with self.path.open("w", newline="") as file:
+        partial = self.path.with_name(self.path.name + ".partial")
+        with partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             if kept:
                 writer.writeheader()
             writer.writerows(kept)
+        partial.replace(self.path)
