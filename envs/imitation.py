@@ -167,11 +167,21 @@ class Imitation(PDCharacterEnv):
         }
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See :meth:`CharacterEnv.get_extra_state`; and where references are lost."""
-        return {**super().get_extra_state(), "difficulty": self._difficulty.state_dict()}
+        """See :meth:`CharacterEnv.get_extra_state`; and what motions there are, and where references are lost."""
+        own = {"motions": self.library.digest, "difficulty": self._difficulty.state_dict()}
+        return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
+        """Restore what :meth:`get_extra_state` gave.
+
+        Raises:
+            ValueError: If it was given with other motions.
+        """
+        if state["motions"] != self.library.digest:
+            raise ValueError(
+                "the run was trained on other motions, or on the same with other weights: resume it with these, or "
+                "begin another from it with stage=pretrain pretrained=<folder>"
+            )
         super().set_extra_state(state)
         self._difficulty.load_state_dict(state["difficulty"])
 

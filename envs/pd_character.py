@@ -175,9 +175,9 @@ def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int)
     others = torch.tensor([model.body(body).id for body in feet])
     collides = torch.tensor(model.geom_contype | model.geom_conaffinity) != 0
     ids = ((owners > 0) & (owners <= num_bodies) & collides & ~torch.isin(owners, others)).nonzero().squeeze(-1)
-    kinds = [mujoco.mjtGeom(kind) for kind in model.geom_type[ids]]
+    kinds = [mujoco.mjtGeom(kind) for kind in model.geom_type[ids.numpy()]]
     half_sizes, radii = torch.zeros(len(ids), 3, dtype=torch.float64), torch.zeros(len(ids), dtype=torch.float64)
-    for row, (kind, size) in enumerate(zip(kinds, torch.tensor(model.geom_size)[ids], strict=True)):
+    for row, (kind, size) in enumerate(zip(kinds, torch.tensor(model.geom_size[ids.numpy()]), strict=True)):
         match kind:
             case mujoco.mjtGeom.mjGEOM_SPHERE:
                 radii[row] = size[0]

@@ -1,14 +1,77 @@
-"""Pictures of a simulation, without a display."""
+"""Pictures of a simulation, without a display, and what is drawn beside it."""
 
-from typing import ClassVar
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.opengl import new_context
+
 Arrow = tuple[np.ndarray, np.ndarray]
 """Tail and tip, each ``(3,)``, in metres."""
+
+Colour = tuple[float, float, float, float]
+"""Red, green, blue and opacity, each from 0 to 1."""
+
+RED: Colour = (0.9, 0.1, 0.1, 1.0)
+PALE: Colour = (0.30, 0.58, 0.95, 0.38)
+
+MAX_SHAPES = 2000
+"""Of a scene. MuJoCo reserves room for them."""
+
+
+class Shape(NamedTuple):
+    """A shape to draw beside a simulation, for ``mujoco.mjv_initGeom``.
+
+    Args:
+        kind: What it is.
+        size: As of a geom of that kind in the model, shape ``(3,)``, in metres.
+        position: Of its centre, or of an arrow's tail, shape ``(3,)``, in metres.
+        orientation: Rotation matrix, shape ``(9,)``.
+        colour: Shape ``(4,)``, float32.
+    """
+
+    kind: mujoco.mjtGeom
+    size: np.ndarray
+    position: np.ndarray
+    orientation: np.ndarray
+    colour: np.ndarray
+
+
+def arrow(tail: np.ndarray, tip: np.ndarray, colour: Colour = RED) -> Shape:
+    """Return an arrow from ``tail`` to ``tip``, each ``(3,)``, in metres."""
+    geom, kind = mujoco.MjvGeom(), mujoco.mjtGeom.mjGEOM_ARROW
+    mujoco.mjv_connector(geom, kind, 0.05, tail, tip)
+    return Shape(kind, geom.size, geom.pos, geom.mat.flatten(), np.array(colour, np.float32))
+
+
+def ghost(model: mujoco.MjModel, qpos: np.ndarray, colour: Colour = PALE) -> list[Shape]:
+    """Return the shapes of all that moves in a model, where they would be in another state.
+
+    Args:
+        model: The model; its shapes are spheres, capsules, cylinders, ellipsoids and boxes.
+        qpos: The state, shape ``(nq,)``.
+        colour: Of all shapes.
+    """
+    data = mujoco.MjData(model)
+    data.qpos = qpos
+    mujoco.mj_kinematics(model, data)
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid])
+    rgba = np.array(colour, np.float32)
+    return [
+        Shape(mujoco.mjtGeom(model.geom_type[i]), model.geom_size[i], data.geom_xpos[i], data.geom_xmat[i], rgba)
+        for i in moving
+    ]
+
+
+def add_shapes(scene: mujoco.MjvScene, shapes: Iterable[Shape]) -> None:
+    """Put shapes into a scene beside what it holds."""
+    for geom, shape in zip(scene.geoms[scene.ngeom :], shapes, strict=False):
+        mujoco.mjv_initGeom(geom, *shape)
+        scene.ngeom += 1
 
 
 class Camera:
@@ -24,39 +87,36 @@ class Camera:
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
 
-    _failure: ClassVar[Exception | None] = None  # MuJoCo ends the process when asked again
-
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1) -> None:
         buffer = model.vis.global_
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
-        if Camera._failure is None:
-            try:
-                self.renderer = mujoco.Renderer(model, height, width)
-            except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-                Camera._failure = error
-        if Camera._failure is not None:
-            raise RuntimeError(
-                "MuJoCo found no OpenGL to draw with. Without a display, set the environment variable MUJOCO_GL before "
-                "Python starts: to egl (Debian: apt install libegl1) or to osmesa (Debian: apt install libosmesa6)"
-            ) from Camera._failure
+        self._opengl = new_context(width, height)
+        self._opengl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._model, self._size = model, mujoco.MjrRect(0, 0, width, height)
+        self.scene = mujoco.MjvScene(model, MAX_SHAPES)
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         self.view.trackbodyid = body
         self.view.azimuth, self.view.elevation = 90.0, -30.0
 
-    def picture(self, data: mujoco.MjData, arrows: list[Arrow], *, distance: float) -> Tensor:
+    def picture(
+        self, data: mujoco.MjData, arrows: Sequence[Arrow] = (), *, distance: float, shapes: Sequence[Shape] = ()
+    ) -> Tensor:
         """Draw the simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
         self.view.distance = distance
-        self.renderer.update_scene(data, self.view)
-        scene = self.renderer.scene
-        for tail, tip in arrows:
-            geom = scene.geoms[scene.ngeom]
-            red, arrow = np.array([0.9, 0.1, 0.1, 1.0], np.float32), mujoco.mjtGeom.mjGEOM_ARROW
-            mujoco.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.zeros(9), red)
-            mujoco.mjv_connector(geom, arrow, 0.05, tail, tip)
-            scene.ngeom += 1
-        return torch.from_numpy(self.renderer.render())
+        option, everything = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, data, option, None, self.view, everything, self.scene)
+        add_shapes(self.scene, [*(arrow(*ends) for ends in arrows), *shapes])
+        pixels = np.empty((self._size.height, self._size.width, 3), np.uint8)
+        self._opengl.make_current()
+        mujoco.mjr_render(self._size, self.scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, self._size, self._context)
+        return torch.from_numpy(pixels[::-1].copy())  # OpenGL counts rows from below
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self.renderer.close()
+        self._opengl.make_current()
+        self._context.free()
+        self._opengl.free()

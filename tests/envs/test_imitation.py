@@ -260,6 +260,14 @@ def test_the_same_state_continues_alike():
     assert torch.equal(*runs)
 
 
+def test_a_checkpoint_knows_its_motions():
+    states = [make(clips={"glide": gliding("biped", turn=turn)}).get_extra_state() for turn in (0.0, TURN)]
+    env = make(clips={"glide": gliding("biped", turn=TURN)})
+    env.set_extra_state(states[1])
+    with pytest.raises(ValueError, match="trained on other motions"):
+        env.set_extra_state(states[0])
+
+
 def test_motions_and_terms_are_checked():
     with pytest.raises(ValueError, match="clips are of humanoid"):
         make("biped", clips={"glide": gliding("humanoid")})

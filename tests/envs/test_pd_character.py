@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.pd_character import lowest_points
+from torchrl_mcp.envs.pd_character import falling_geoms, lowest_points
 
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 
@@ -139,3 +139,11 @@ def test_a_finer_time_step_takes_more_substeps(character):
 @every_character
 def test_specs_describe_what_the_environment_does(character):
     check_env_specs(make(character), seed=0)
+
+
+def test_a_body_of_one_shape_falls_too():
+    spec = mujoco.MjSpec()
+    for name in ("trunk", "foot"):
+        spec.worldbody.add_body(name=name).add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.2, 0, 0])
+    ids, half_sizes, radii = falling_geoms(spec.compile(), ("foot",), 2)
+    assert (ids.tolist(), half_sizes.tolist(), radii.tolist()) == ([0], [[0, 0, 0]], [0.2])

@@ -1,0 +1,65 @@
+"""The OpenGL with which MuJoCo draws into memory, found without being told."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from typing import Protocol
+
+import mujoco
+
+PLATFORMS = ("egl", "osmesa", "glfw")
+"""Values of ``MUJOCO_GL`` on Linux in the order in which they are tried: a GPU's driver, the processor, a display."""
+
+PROBE = """
+import mujoco
+context = mujoco.GLContext(8, 8)
+context.make_current()
+mujoco.MjrContext(mujoco.MjSpec().compile(), mujoco.mjtFontScale.mjFONTSCALE_100)
+"""
+
+
+class GLContext(Protocol):
+    """What MuJoCo's contexts of all platforms can do."""
+
+    def make_current(self) -> None:
+        """Let what is drawn next be drawn here."""
+
+    def free(self) -> None:
+        """Give back what it holds."""
+
+
+def new_context(width: int, height: int) -> GLContext:
+    """Open OpenGL for pictures up to a size in pixels.
+
+    Raises:
+        RuntimeError: If none works here, or not the one that the environment variable ``MUJOCO_GL`` names.
+    """
+    if (platform := _platform()) is None:
+        asked = os.environ.get("MUJOCO_GL")
+        raise RuntimeError(
+            f"MuJoCo found no OpenGL to draw with{f' for MUJOCO_GL={asked}' if asked else ''}. Without a display it "
+            "needs EGL (Debian: apt install libegl1, and a GPU's driver) or OSMesa (Debian: apt install libosmesa6). "
+            "Leave the environment variable MUJOCO_GL unset to take the one that works, or set it to insist on one"
+        )
+    return platform(width, height)
+
+
+@cache
+def _platform() -> Callable[[int, int], GLContext] | None:
+    """Return the class of contexts that works here: ``MUJOCO_GL``'s if that is set, else the first of ``PLATFORMS``."""
+    asked = os.environ.get("MUJOCO_GL", "")
+    found = next(filter(_works, PLATFORMS if sys.platform == "linux" and not asked else (asked,)), None)
+    if found not in PLATFORMS:
+        return None if found is None else mujoco.GLContext
+    # MuJoCo has chosen a class of its own on import. Where OpenGL's functions are it looks up when it first draws.
+    os.environ["MUJOCO_GL"] = found
+    return import_module(f"mujoco.{found}").GLContext
+
+
+def _works(platform: str) -> bool:
+    """Try a platform in a process of its own: a failure may end the process, and PyOpenGL keeps to its first choice."""
+    environment = {**os.environ, "MUJOCO_GL": platform}
+    return subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0

@@ -1,0 +1,80 @@
+"""What a task means, drawn beside its simulation: arrows to targets, and the reference as a ghost."""
+
+import copy
+
+import mujoco
+import numpy as np
+from torch import Tensor
+
+from torchrl_mcp.envs.base import CharacterEnv
+from torchrl_mcp.envs.imitation import Imitation
+from torchrl_mcp.envs.motions.placement import Placement
+from torchrl_mcp.envs.rendering import Shape, arrow, ghost
+
+HAZE = (0.87, 0.90, 0.94, 1.0)
+"""Colour into which the ground fades."""
+
+GROUND = (150, 205)
+"""Darkest and lightest pixel of the ground, of 255."""
+
+
+def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Shape]:
+    """Return what to draw beside one of the simulations.
+
+    Args:
+        env: The environments.
+        index: The simulation.
+        aside: Metres by which a ghost is moved along y, so as not to cover the character; 0 leaves it where it belongs.
+    """
+    shapes = [arrow(*ends) for ends in env._arrows(index)]
+    if isinstance(env, Imitation):
+        qpos = reference(env, index)
+        qpos[1] += aside
+        shapes += ghost(env.simulation.model, qpos.numpy())
+    return shapes
+
+
+def reference(env: Imitation, index: int = 0) -> Tensor:
+    """State in which the reference of one of the simulations is now, where the character is to be, ``(nq,)``."""
+    clip, time, turn, shift = (env.episode[key][index : index + 1] for key in ("clip", "time", "turn", "shift"))
+    return env.library.at(clip, time, Placement(turn, shift)).qpos[0]
+
+
+def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy of a scene in soft light, whose ground is pale, mirrors nothing and fades into :data:`HAZE`.
+
+    The haze is drawn where a scene's flag ``mjRND_FOG`` is set.
+    """
+    model = copy.copy(model)
+    light = model.vis.headlight
+    light.ambient, light.diffuse, light.specular = [0.38] * 3, [0.35] * 3, [0.05] * 3
+    model.light_diffuse[:], model.light_specular[:] = 0.55, 0.1
+    model.vis.rgba.fog = HAZE
+    model.vis.map.fogstart, model.vis.map.fogend = np.array([5.0, 15.0]) / model.stat.extent
+    model.vis.map.shadowclip = 35.0 / model.stat.extent  # where the map of shadows ends the ground is speckled
+    model.mat_reflectance[:] = 0
+    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+        _extend(model, plane)
+        texture = model.mat_texid[model.geom_matid[plane], mujoco.mjtTextureRole.mjTEXROLE_RGB]
+        size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+        pixels = model.tex_data[model.tex_adr[texture] :][:size]
+        pixels[:] = pixels.clip(*GROUND)
+    return model
+
+
+def reach(model: mujoco.MjModel) -> float:
+    """Return how far the first body below the world, in its rest pose, extends from its centre of mass, in metres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    own = model.body_rootid[model.geom_bodyid] == 1
+    distances = np.linalg.norm(data.geom_xpos[own] - data.subtree_com[1], axis=-1)
+    return float((distances + model.geom_rbound[own]).max())
+
+
+def _extend(model: mujoco.MjModel, plane: int) -> None:
+    """Make a plane endless, with its pattern as it was: MuJoCo draws haze on large finite ones as if they were far."""
+    size, material = model.geom_size[plane, :2], model.geom_matid[plane]
+    if (size > 0).all() and not model.mat_texuniform[material]:
+        model.mat_texrepeat[material] /= size
+        model.mat_texuniform[material] = True
+    size[:] = 0
