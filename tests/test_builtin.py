@@ -62,12 +62,36 @@ def test_primitives_are_transferred_from_what_comes_with_the_library(run, publis
         assert torch.equal(parameter, original.parts["primitives"].state_dict()[name].bfloat16().float())
 
 
+def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
+    settings = [*BIPED, "motions=turning", "training.total_frames=128"]
+    for origin, missing in ((checkpoint.find(run), set()), (published, {"critic"})):
+        cfg = configure(tmp_path / "run", *settings, f"pretrained={origin}")
+        env = experiment.make_env(cfg, num_envs=1, seed=0)
+        assert len(env.library) == 7
+        agent, other = experiment.make_agent(cfg, env, origin), experiment.restore(origin, num_envs=1, seed=0)[1]
+        for name in set(agent.parts) - missing:
+            assert parameters(agent.parts[name]) == parameters(other.parts[name])
+    folder = experiment.train(cfg)
+    assert checkpoint.find(folder).is_file()
+
+
+def parameters(part):
+    return {name: value.tolist() for name, value in part.state_dict().items()}
+
+
 def test_what_does_not_come_with_the_library_is_named(published, tmp_path, monkeypatch):
     monkeypatch.setattr(builtin, "FOLDER", published.parent)
     cfg = configure(tmp_path / "run", "method=mcp", "character=trex", "task=heading", "stage=transfer")
     cfg.pretrained = "builtin"
-    with pytest.raises(ValueError, match="no network for method=mcp and character=trex, only mcp-biped"):
+    with pytest.raises(ValueError, match=r"no network for method=mcp and character=trex .* only mcp-biped"):
         experiment.train(cfg)
+
+
+def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
+    assert builtin.locate(str(tmp_path)) == tmp_path
+    assert builtin.locate("builtin:biped") == builtin.FOLDER / "mcp-biped.torchrl"
+    with pytest.raises(ValueError, match="character=dog comes with the library, only mcp-biped, mcp-humanoid"):
+        builtin.locate("builtin:dog")
 
 
 @pytest.mark.parametrize("path", sorted(builtin.FOLDER.glob("*.torchrl")), ids=lambda path: path.stem)

@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from torchrl_mcp import conf, experiment
+from torchrl_mcp import conf, evaluate, experiment, train
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
@@ -42,8 +42,12 @@ def run(tmp_path_factory):
 def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run):
     root = run.parents[5]
     assert {path.name for path in root.iterdir()} == {"runs"}
-    assert {path.name for path in run.iterdir()} == {"config.yaml", "metrics.csv", "checkpoints"}
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "origin.json", "metrics.csv", "checkpoints"}
     assert OmegaConf.load(run / "config.yaml").method.name == "mcp"
+    origin = json.loads((run / "origin.json").read_text())
+    assert origin["command"] == ["torchrl-mcp-train", *FAST, "task.pretrain.max_episode_steps=100"]
+    assert origin["choices"]["preset"] == "smoke"
+    assert "hydra/launcher" not in origin["choices"]
 
 
 def test_a_multirun_makes_a_folder_per_job(tmp_path):
@@ -119,10 +123,71 @@ def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched
     assert contents(copy) == before
 
 
-def test_a_finished_run_resumes_to_itself(run):
-    before = (run / "metrics.csv").read_text()
-    experiment.resume(run)
-    assert (run / "metrics.csv").read_text() == before
+def test_a_complete_run_is_left_as_it_is_and_said_to_be_complete(run, monkeypatch, capsys):
+    before = contents(run)
+    monkeypatch.setattr(sys, "argv", ["train", f"resume={run}"])
+    train.main()
+    assert f"{run} is complete: nothing is left to do" in capsys.readouterr().out
+    assert contents(run) == before
+
+
+@pytest.fixture(scope="module")
+def evaluated(run, tmp_path_factory):
+    """The run, resumed after its configuration asked for an evaluation."""
+    copy = tmp_path_factory.mktemp("evaluated") / "run"
+    shutil.copytree(run, copy)
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.evaluation.episodes = 3
+    OmegaConf.save(cfg, copy / "config.yaml")
+    assert not experiment.is_complete(copy)
+    experiment.resume(copy)
+    return copy
+
+
+def test_training_ends_with_an_evaluation_also_after_a_resume(evaluated):
+    assert experiment.is_complete(evaluated)
+    written = json.loads((evaluated / "evaluation.json").read_text())
+    assert (written["episodes"], written["seed"], written["environment"]) == (3, 12345, {})
+    for mode in ("deterministic", "stochastic"):
+        assert written[mode]["episodes"] == 3
+        assert "gates/entropy" in written[mode]["diagnostics"]
+
+
+def test_the_evaluate_command_writes_what_training_writes(evaluated, monkeypatch, capsys):
+    written = (evaluated / "evaluation.json").read_text()
+    output = evaluated / "again.json"
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(evaluated), "--episodes", "3", "--output", str(output)])
+    evaluate.main()
+    assert output.read_text() == written
+
+
+def test_a_run_that_is_to_go_on_loses_its_evaluation_and_gets_another(evaluated, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(evaluated, copy)
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.training.total_frames *= 2
+    OmegaConf.save(cfg, copy / "config.yaml")
+    assert not experiment.is_complete(copy)
+    experiment.resume(copy)
+    assert experiment.is_complete(copy)
+    assert (copy / "evaluation.json").read_text() != (evaluated / "evaluation.json").read_text()
+
+
+def test_a_run_of_before_there_were_evaluations_is_evaluated_as_a_new_one(evaluated, tmp_path):
+    cfg = OmegaConf.load(evaluated / "config.yaml")
+    del cfg["evaluation"]
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    assert experiment.configuration(tmp_path).evaluation == {"episodes": 128, "seed": 12345, "environment": {}}
+
+
+def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():
+    for method in ("mcp", "finetune", "hierarchical"):
+        evaluation = configure("task=imitation", "character=biped", f"method={method}", "preset=fast").evaluation
+        assert OmegaConf.to_container(evaluation, resolve=True) == {
+            "episodes": 128,
+            "seed": 12345,
+            "environment": {"clip_end": "switch", "switch_interval": 5.0},
+        }
 
 
 @pytest.mark.parametrize(("method", "stage", "step_size"), [("mcp", "pretrain", 2e-5), ("mcp", "transfer", 5e-5)])

@@ -12,6 +12,9 @@ from torchrl_mcp.checkpoint import run_checkpoint
 
 FOLDER = Path(__file__).parent / "networks"
 
+PREFIX = "builtin:"
+"""What a command line says before the name of a character, for the networks of MCP that come with the library."""
+
 
 def builtin(method: str, character: str) -> Path:
     """Return the checkpoint file of a method's pre-training that comes with the library.
@@ -23,10 +26,20 @@ def builtin(method: str, character: str) -> Path:
     if not path.is_file():
         there = ", ".join(sorted(file.stem for file in FOLDER.glob("*.torchrl")))
         raise ValueError(
-            f"pretrained=builtin has no network for method={method} and character={character}, only {there}: "
-            "pre-train one with stage=pretrain and give its run folder as pretrained=<folder>"
+            f"no network for method={method} and character={character} comes with the library, only {there}: "
+            "pre-train one with stage=pretrain and give its run folder instead"
         )
     return path
+
+
+def locate(checkpoint: str) -> Path:
+    """Return the run folder or checkpoint file that a command line names, which may be ``builtin:CHARACTER``.
+
+    Raises:
+        ValueError: If the networks do not come with the library.
+    """
+    is_builtin = checkpoint.startswith(PREFIX)
+    return builtin("mcp", checkpoint.removeprefix(PREFIX)) if is_builtin else Path(checkpoint)
 
 
 def publish(parts: nn.ModuleDict, config: Mapping[str, Any], path: Path) -> None:

@@ -91,6 +91,11 @@ def find(path: Path) -> Path:
     raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
 
 
+def frames(path: Path) -> int:
+    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written."""
+    return int(path.stem.rpartition("-")[2])
+
+
 def configuration(path: Path) -> Mapping[str, Any]:
     """Return the configuration of the run that wrote the checkpoint file ``path``.
 

@@ -1,4 +1,7 @@
-"""``torchrl-mcp-evaluate``: how good is a trained policy?"""
+"""``torchrl-mcp-evaluate``: how good is a trained policy?
+
+With ``--output RUN/evaluation.json`` it leaves in a run folder what training ends with.
+"""
 
 import argparse
 import json
@@ -7,14 +10,17 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
+from torchrl_mcp.builtin import locate
 from torchrl_mcp.diagnostics import COLLAPSED
-from torchrl_mcp.experiment import evaluate_clips, evaluate_run
+from torchrl_mcp.experiment import evaluate_clips, evaluation
 
 
 def main() -> None:
     """Play one episode in each of many environments and print what came of it."""
-    parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__)
-    parser.add_argument("path", type=Path, help="run folder, of which the newest checkpoint counts, or checkpoint file")
+    parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
+    )
     parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
     parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
     parser.add_argument(
@@ -23,12 +29,14 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
     arguments = parser.parse_args()
     try:
-        clips = evaluate_clips(arguments.path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
-        results = evaluate_run(arguments.path, episodes=arguments.episodes, seed=arguments.seed)
+        path = locate(arguments.checkpoint)
+        clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
+        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
     except ValueError as error:
         sys.exit(f"torchrl-mcp-evaluate: {error}")
-    print(f"{arguments.path}: {arguments.episodes} episodes, seed {arguments.seed}")
-    for mode, numbers in results.items():
+    print(f"{arguments.checkpoint}: {arguments.episodes} episodes, seed {arguments.seed}")
+    for mode in ("deterministic", "stochastic"):
+        numbers = results[mode]
         low, high = numbers["interval"]
         print(
             f"  {mode:13} normalised return {numbers['normalised_return']:.3f} "

@@ -1,5 +1,6 @@
 """From a configuration to objects. Beside the entry points, the only module that knows Hydra."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
@@ -14,7 +16,7 @@ from torch import nn
 from torchrl.envs import Compose
 from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp import checkpoint
+from torchrl_mcp import checkpoint, origin
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.analysis.imitation import ClipResult, follow_each
 from torchrl_mcp.builtin import builtin, publish
@@ -27,6 +29,7 @@ from torchrl_mcp.training import Trainer
 from torchrl_mcp.transfer import FrozenParts, require_parts
 
 CONFIG = "config.yaml"
+EVALUATION = "evaluation.json"
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,11 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
 
 
 def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
-    """Return the agent of the configured method, its kept parts from the checkpoint file ``pretrained`` if given."""
+    """Return the agent of the configured method.
+
+    If the checkpoint file ``pretrained`` is given, the parts that transfer keeps come from it, or in pre-training all
+    that it holds.
+    """
     sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
     parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
     names: Sequence[str] = ()
@@ -69,6 +76,8 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     frozen = FrozenParts(parts, names)
     actor = instantiate(cfg.actor)(parts, frozen=names)
     critic = instantiate(cfg.critic)(parts, sizes["observation"], sizes["goal"])
+    if cfg.stage.name == "pretrain" and pretrained is not None:
+        checkpoint.load_agent(parts, pretrained)
     parts.to(cfg.device)
     return Agent(parts, actor, critic, frozen)
 
@@ -111,7 +120,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv | TransformedC
 
 
 def train(cfg: DictConfig) -> Path:
-    """Train from the start in the run folder ``cfg.run_dir``, and return it.
+    """Train from the start in the run folder ``cfg.run_dir``, evaluate the policy, and return the folder.
 
     Raises:
         ValueError: If the folder holds a run already, or the configuration lacks the checkpoint to transfer from.
@@ -122,27 +131,58 @@ def train(cfg: DictConfig) -> Path:
     trainer = _trainer(cfg, folder, _pretrained(cfg))
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
+    _write(origin.origin(cfg.device), folder / origin.FILE)
     # Last, because it is what says that there is a run to resume.
     OmegaConf.save(cfg, folder / CONFIG, resolve=True)
-    trainer.record.loggers = _loggers(cfg)
-    trainer.run()
+    _finish(trainer, cfg, folder)
     return folder
 
 
 def resume(folder: Path) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with the configuration it began with.
 
+    A run that :func:`is_complete` is left as it is.
+
     Raises:
         ValueError: If the folder holds no run, or its checkpoint is damaged.
+    """
+    if is_complete(folder):
+        return folder
+    cfg, newest = configuration(folder), checkpoint.find(folder)
+    if checkpoint.frames(newest):
+        trainer = _trainer(cfg, folder)
+        trainer.restore(newest)
+    else:  # the environments have not been reset yet, so there is no state of theirs to return to
+        trainer = _trainer(cfg, folder, _pretrained(cfg))
+        trainer.record.rewind(0)
+    (folder / EVALUATION).unlink(missing_ok=True)
+    _finish(trainer, cfg, folder)
+    return folder
+
+
+def configuration(folder: Path) -> DictConfig:
+    """Return the configuration of the run in ``folder``; what it has not of ``evaluation`` is as in a new run.
+
+    Raises:
+        ValueError: If the folder holds no run.
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
-    trainer = _trainer(cfg, folder)
-    trainer.restore(checkpoint.find(folder))
-    trainer.record.loggers = _loggers(cfg)
-    trainer.run()
-    return folder
+    if "evaluation" not in cfg:
+        cfg.evaluation = _usual_evaluation(cfg.task.name)
+    return cfg
+
+
+def is_complete(folder: Path) -> bool:
+    """Tell whether the run in ``folder`` has taken all its steps and has been evaluated.
+
+    Raises:
+        ValueError: If the folder holds no run.
+    """
+    cfg = configuration(folder)
+    trained = checkpoint.frames(checkpoint.find(folder)) >= cfg.training.total_frames
+    return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
 
 
 def restore(
@@ -184,6 +224,28 @@ def publish_run(path: Path, output: Path) -> None:
     cfg.run_dir = cfg.run_root = "runs"  # where it lay is of no use to others
     parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
     publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output)
+
+
+def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
+    """Return what ``evaluation.json`` says of a run: :func:`evaluate_run` in the environments of its configuration.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+
+    Returns:
+        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, ``deterministic`` and
+        ``stochastic``.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    cfg = OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
+    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual_evaluation(cfg.task.name), resolve=True)
+    environment = settings["environment"]
+    numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
+    return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
@@ -239,13 +301,36 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
     return make_trainer(cfg, agent, env, folder)
 
 
+def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
+    """Train to the end and evaluate what came of it."""
+    trainer.record.loggers = _loggers(cfg)
+    trainer.run()
+    if cfg.evaluation.episodes:
+        numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
+        _write(numbers, folder / EVALUATION)
+
+
+def _usual_evaluation(task: str) -> DictConfig:
+    """Return how a new run of a task is evaluated."""
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", [f"task={task}"]).evaluation
+
+
+def _write(content: dict[str, Any], path: Path) -> None:
+    """Write a JSON file that is whole if it is there."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(content, indent=2) + "\n")
+    part.replace(path)
+
+
 def _loggers(cfg: DictConfig) -> list[Logger]:
     return [instantiate(cfg.logger)] if cfg.logger else []
 
 
 def _pretrained(cfg: DictConfig) -> Path | None:
-    """Return the checkpoint file to transfer from, or None where nothing is transferred."""
-    if cfg.stage.name != "transfer" or not cfg.transfer.keep:
+    """Return the checkpoint file to begin from, or None to begin from nothing."""
+    transfers = cfg.stage.name == "transfer"
+    if (transfers and not cfg.transfer.keep) or (not transfers and cfg.pretrained is None):
         return None
     if cfg.pretrained is None:
         raise ValueError(
