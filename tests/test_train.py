@@ -1,10 +1,11 @@
+import sys
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
 
 import torchrl_mcp.conf
-from torchrl_mcp.train import suggestions
+from torchrl_mcp.train import main, suggestions
 
 CONF = Path(torchrl_mcp.conf.__file__).parent
 PARTS = ("hierarchy",)  # of one method's configuration, which takes both
@@ -66,3 +67,21 @@ def test_only_the_unknown_among_several_are_answered():
 @pytest.mark.parametrize("arguments", [["mixer"], ["a=[1,"], ["method=no_such", "sead=2"]])
 def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
     assert suggestions(arguments) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (["benchmark=mixer", "sead=3"], "nearest are: seed"),
+        (["benchmark=mixr"], "exploration\n\tfreeze\n\tmixer"),
+        (["benchmark=mixer", "mixer=aditive"], "additive\n\tmultiplicative"),
+    ],
+)
+def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, capsys, arguments, answer):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code
+    said = capsys.readouterr().err + str(stop.value.code)
+    assert answer in said
+    assert "Traceback" not in said

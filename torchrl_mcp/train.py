@@ -1,4 +1,4 @@
-"""``torchrl-mcp-train``: train a method on a task, alone or in a Hydra multirun."""
+"""``torchrl-mcp-train``: train a method on a task, alone, in a Hydra multirun, or as a benchmark of many."""
 
 import difflib
 import sys
@@ -10,23 +10,38 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp import experiment
+from torchrl_mcp import experiment, sweep
 
 
 @hydra.main(version_base="1.3", config_path="pkg://torchrl_mcp.conf", config_name="train")
 def run(cfg: DictConfig) -> None:
     """Train as ``cfg`` says, or continue the run folder ``cfg.resume``."""
     try:
-        folder = experiment.resume(Path(cfg.resume)) if cfg.resume else experiment.train(cfg)
+        folder = _resume(Path(cfg.resume)) if cfg.resume else experiment.train(cfg)
     except ValueError as error:
         sys.exit(f"torchrl-mcp-train: {error}")
     print(f"run folder: {folder}")
 
 
+def run_benchmark(arguments: list[str]) -> None:
+    """Run many runs, or what is left of them."""
+    try:
+        sweep.main(arguments)
+    except HydraException as error:
+        print(error, file=sys.stderr)
+        sys.exit(1)
+    except ValueError as error:
+        sys.exit(f"torchrl-mcp-train: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\ntorchrl-mcp-train: interrupted; call it again to go on from here")
+
+
 def main() -> None:
     """Run the command line, and where it names an unknown setting say which one was perhaps meant."""
+    arguments = [argument for argument in sys.argv[1:] if argument not in ("-m", "--multirun")]
+    benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
-        run()
+        run_benchmark(arguments) if benchmark else run()
     except SystemExit as stop:
         if stop.code == 1:
             print(*suggestions(sys.argv[1:]), sep="\n", file=sys.stderr)
@@ -51,6 +66,12 @@ def suggestions(arguments: list[str]) -> list[str]:
         + ", ".join(difflib.get_close_matches(key, {*groups, *settings}, n=3, cutoff=0.5) or sorted(groups))
         for key in unknown
     ]
+
+
+def _resume(folder: Path) -> Path:
+    if experiment.is_complete(folder):
+        print(f"{folder} is complete: nothing is left to do")
+    return experiment.resume(folder)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:
