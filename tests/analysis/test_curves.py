@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from matplotlib import _pylab_helpers
 from matplotlib.colors import same_color
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, save_figure, write_curves
+from torchrl_mcp.analysis.curves import plot_curves
 
 RETURN = "episode/normalised_return"
 
@@ -114,6 +116,25 @@ def test_each_curve_is_one_line_of_its_own_colour_that_the_legend_names(tmp_path
     assert not any(same_color(a.get_color(), b.get_color()) for a in lines[:7] for b in lines[:7] if a is not b)
     for line in lines:
         np.testing.assert_allclose(line.get_ydata(), 0.5)
+
+
+def test_lines_can_have_styles_of_their_own_and_need_no_legend(tmp_path):
+    curves = learning_curves({name: [constant_run(tmp_path / name, 0.5)] for name in "ab"})
+    axes = Figure().add_subplot()
+    plot_curves(axes, curves, [{"color": "red", "linestyle": "--"}, {"color": "blue", "linewidth": 3}])
+    first, second = axes.lines
+    assert (first.get_color(), first.get_linestyle(), second.get_linewidth()) == ("red", "--", 3)
+    assert axes.get_legend() is None
+
+
+def test_seeds_that_never_ran_at_the_same_time_have_no_curve_but_can_be_drawn(tmp_path):
+    early = write_run(tmp_path / "early", [(100, 1, 0.5)])
+    late = write_run(tmp_path / "late", [(1000, 1, -0.5)])
+    curves = learning_curves({"both": [early, late], "late": [late]}, num_bins=10)
+    assert [len(curve.frames) for curve in curves] == [0, 1]
+    low, high = draw_curves(curves).axes[0].get_ylim()
+    assert low <= -0.5
+    assert high >= 0
 
 
 def test_saved_figures_show_something_and_are_the_same_bytes_again(tmp_path):

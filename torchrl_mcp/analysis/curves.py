@@ -2,12 +2,14 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
@@ -92,20 +94,42 @@ def write_curves(curves: Sequence[Curve], path: Path) -> None:
 def draw_curves(
     curves: Sequence[Curve], *, xlabel: str = "environment steps", ylabel: str = "normalised return"
 ) -> Figure:
-    """Draw curves as lines, each with the range of its seeds as a band around it."""
+    """Draw curves as lines, each with the range of its seeds as a band around it, and a legend above."""
     figure = new_figure(6.4, 3.6)
-    axes = figure.add_subplot()
-    for curve, colour in zip(curves, cycle(COLOURS), strict=False):
-        axes.fill_between(curve.frames, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(curve.frames, curve.mean, color=colour, linewidth=2, label=_legend(curve), solid_capstyle="round")
+    plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def plot_curves(
+    axes: Axes,
+    curves: Sequence[Curve],
+    styles: Iterable[Mapping[str, Any]] = (),
+    *,
+    xlabel: str = "environment steps",
+    ylabel: str = "normalised return",
+) -> None:
+    """Plot curves as lines, each with the range of its seeds as a band around it.
+
+    Args:
+        axes: Where to.
+        curves: The curves.
+        styles: Matplotlib's ``color`` and other properties of each line; without it, the colours of all figures.
+        xlabel: What the steps are.
+        ylabel: What the quantity is.
+    """
+    styles = styles or ({"color": colour, "linewidth": 2} for colour in cycle(COLOURS))
+    for curve, style in zip(curves, styles, strict=False):
+        axes.fill_between(curve.frames, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0)
+        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", **style)
     axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]) if min(curve.low.min() for curve in curves) < 0 else 0.0)
+    lowest = min(curve.low.min(initial=0.0) for curve in curves)
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(min(0.0, bottom) if lowest < 0 else 0.0, max(0.0, top))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(axis="y", color="#EEEEEE")
     axes.set_axisbelow(True)
     bare(axes)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
-    return figure
 
 
 def _legend(curve: Curve) -> str:

@@ -1,0 +1,215 @@
+import math
+
+import pytest
+
+from torchrl_mcp.analysis.comparison import ablations, caveats, cells, over_tasks
+from torchrl_mcp.analysis.results import read_run
+
+
+def grouped(*folders):
+    return cells([read_run(folder) for folder in folders])
+
+
+def test_seeds_share_a_cell_with_their_mean_deviation_and_interval(write_run):
+    (cell,) = grouped(*(write_run(str(seed), seed=seed, score=score) for seed, score in enumerate([0.4, 0.5, 0.9])))
+    assert [run.seed for run in cell.runs] == [0, 1, 2]
+    assert (cell.settings, cell.remarks) == ({}, [])
+    estimate = cell.mean()
+    assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.6, 0.4, 0.9))
+    assert cell.mean("stochastic").value == pytest.approx(0.5)
+    assert cell.deviation() == pytest.approx(math.sqrt((0.04 + 0.01 + 0.09) / 2))
+
+
+def test_tasks_characters_stages_and_methods_are_apart_in_the_papers_order(write_run):
+    folders = [
+        write_run("a", method="mine"),
+        write_run("b", method="moe"),
+        write_run("c", method="finetune"),
+        write_run("d", method="finetune", stage="pretrain"),
+        write_run("e", task="dribble", character="trex"),
+        write_run("f", task="carry"),
+        write_run("g", task="juggle"),
+    ]
+    found = [(cell.place, cell.stage, cell.method) for cell in grouped(*folders)]
+    assert found == [
+        (("heading", "biped"), "pretrain", "finetune"),
+        (("heading", "biped"), "transfer", "finetune"),
+        (("heading", "biped"), "transfer", "moe"),
+        (("heading", "biped"), "transfer", "mine"),
+        (("carry", "biped"), "transfer", "scratch"),
+        (("dribble", "trex"), "transfer", "scratch"),
+        (("juggle", "biped"), "transfer", "scratch"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"preset": "paper"}, ("preset", "paper")),
+        ({"preset": None}, ("preset", "unknown")),
+        ({"total_frames": 2000}, ("total_frames", 2000)),
+        ({"num_primitives": 4}, ("num_primitives", 4)),
+        ({"mixer__name": "additive"}, ("mixer", "additive")),
+        ({"exploration__name": "weights"}, ("exploration", "weights")),
+        ({"transfer__freeze": ["observation_normaliser"]}, ("trained", "gate and primitives")),
+        ({"pretrained": "builtin"}, ("pretrained", "builtin")),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_runs_with_different_choices_are_never_averaged(write_mcp, settings, told):
+    usual, other = grouped(write_mcp("a", score=0.2), write_mcp("b", seed=1, score=0.8, **settings))
+    if usual.runs[0].seed:
+        usual, other = other, usual
+    assert (usual.mean().value, other.mean().value) == (0.2, 0.8)
+    assert told in other.settings.items()
+    assert set(other.settings) >= set(usual.settings)
+
+
+def test_any_other_difference_of_the_configuration_tells_cells_apart(write_run):
+    steps = [1e-4, 3e-4, 1e-4]
+    folders = [write_run(str(i), seed=i, score=0.5, optimizer__lr=step) for i, step in enumerate(steps)]
+    found = grouped(*folders)
+    assert [(cell.settings, len(cell.runs)) for cell in found] == [
+        ({"optimizer.lr": 1e-4}, 2),
+        ({"optimizer.lr": 3e-4}, 1),
+    ]
+
+
+def test_what_a_choice_brings_along_goes_without_saying(write_run):
+    fast, paper = (write_run(p, preset=p, optimizer__lr=step) for p, step in {"fast": 1e-3, "paper": 1e-6}.items())
+    assert [cell.settings for cell in grouped(fast, paper)] == [{"preset": "fast"}, {"preset": "paper"}]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"device": "cuda"},
+        {"pretrained": "runs/other"},
+        {"logger__name": "csv"},
+        {"task__fast__num_envs": 3},
+        {"task__pretrain__speed": 2.0},
+        {"evaluation__episodes": 3},
+        {"added_later": 1},
+    ],
+    ids=str,
+)
+def test_what_changes_no_learning_parts_no_seeds(write_run, setting):
+    (name,) = setting
+    before = {} if name == "added_later" else {name: None}
+    (cell,) = grouped(write_run("a", **before), write_run("b", seed=1, **setting))
+    assert len(cell.runs) == 2
+
+
+def test_only_complete_runs_count_and_the_others_are_remarked(write_run):
+    (cell,) = grouped(
+        write_run("a", score=0.5),
+        write_run("b", seed=1, score=0.7),
+        write_run("c", seed=2, score=9.0, progress=0.25),
+        write_run("d", seed=3, progress=0.25),
+        write_run("e", seed=4),
+        write_run("f", seed=5, score=math.nan),
+    )
+    assert cell.mean().value == pytest.approx(0.6)
+    assert cell.remarks == ["seeds 2, 3 unfinished, 25% of the steps", "seed 4 not evaluated", "seed 5 damaged"]
+
+
+def test_a_cell_without_a_complete_run_has_no_numbers_but_a_standing(write_run):
+    (cell,) = grouped(write_run("a", progress=0.2), write_run("b", seed=1, progress=0.4))
+    assert (cell.mean(), cell.gap, cell.standing) == (None, None, "30% trained")
+
+
+def test_a_single_seed_has_the_interval_of_its_episodes(write_run):
+    (cell,) = grouped(write_run("a", score=0.5))
+    assert (cell.mean().low, cell.mean().high) == (0.48, 0.52)
+    assert math.isnan(cell.deviation())
+    assert cell.remarks == ["one seed, so that the interval is over its episodes"]
+
+
+def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_run):
+    (cell,) = grouped(write_run("a", score=0.5), write_run("b", score=0.5, episodes=32))
+    assert cell.remarks == [
+        "seed 0 occurs more than once",
+        "mixed evaluations: 128 episodes of seed 12345, 32 episodes of seed 12345",
+    ]
+
+
+def test_caveats_tell_what_differs_between_cells(write_run, write_mcp):
+    found = grouped(
+        write_run("a", commit="aaa"),
+        write_run("b", commit="bbb", total_frames=2000),
+        write_mcp("c", commit="aaa", preset="paper", total_frames=3000),
+    )
+    assert caveats(found) == ["presets: fast, paper", "commits: aaa, bbb", "steps of Scratch: 1,000, 2,000"]
+
+
+def test_the_gap_is_our_mean_less_the_papers(write_mcp):
+    (cell,) = grouped(write_mcp("a", score=0.5), write_mcp("b", seed=1, score=0.7))
+    assert cell.reported == (0.976, 0.002)
+    assert cell.gap == pytest.approx(0.6 - 0.976)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_primitives": 4},
+        {"mixer__name": "additive"},
+        {"transfer__freeze": []},
+        {"stage": "pretrain"},
+        {"task": "juggle"},
+        {"character": "ant"},
+    ],
+    ids=str,
+)
+def test_the_paper_has_no_figure_for_what_it_did_not_measure(write_mcp, settings):
+    (cell,) = grouped(write_mcp("a", score=0.5, **settings))
+    assert (cell.reported, cell.gap) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("setting", "key", "values"),
+    [
+        ("num_primitives", "num_primitives", [4, 8, 16]),
+        ("mixer", "mixer__name", ["additive", "multiplicative"]),
+        ("exploration", "exploration__name", ["action", "weights"]),
+    ],
+)
+def test_an_ablation_holds_the_cells_that_differ_in_its_setting_alone(write_mcp, write_run, setting, key, values):
+    folders = [write_mcp(f"{value}", **{key: value}) for value in reversed(values)]
+    others = [write_mcp("longer", total_frames=2000), write_run("scratch"), write_mcp("task", task="carry")]
+    (found,) = ablations(grouped(*folders, *others), setting)
+    assert [cell.choices[setting] for cell in found.cells] == values
+    assert all(cell.runs[0].total_frames == 1000 for cell in found.cells)
+
+
+def test_training_the_primitives_as_well_is_an_ablation_of_transfer_alone(write_mcp):
+    variants = [{}, {"transfer__freeze": ["observation_normaliser"]}]
+    folders = [write_mcp(f"{s}-{i}", stage=s, **v) for s in ("transfer", "pretrain") for i, v in enumerate(variants)]
+    (found,) = ablations(grouped(*folders), "trained")
+    assert [(cell.stage, cell.choices["trained"]) for cell in found.cells] == [
+        ("transfer", "gate"),
+        ("transfer", "gate and primitives"),
+    ]
+
+
+def test_methods_are_compared_over_the_tasks_that_all_of_them_did(write_run, write_mcp):
+    found = grouped(
+        *(
+            write_run(f"s{t}{i}", task=t, seed=i, score=0.1 * i)
+            for t in ("heading", "carry", "dribble")
+            for i in (1, 2)
+        ),
+        *(write_mcp(f"m{t}{i}", task=t, seed=i, score=0.2 * i) for t in ("heading", "carry") for i in (1, 2)),
+        write_mcp("unfinished", task="dribble", progress=0.5),
+        write_mcp("variant", task="dribble", num_primitives=4, score=0.9),
+    )
+    places, estimates = over_tasks(found)
+    assert places == [("heading", "biped"), ("carry", "biped")]
+    assert {method: estimate.value for method, estimate in estimates.items()} == pytest.approx(
+        {"scratch": 0.15, "mcp": 0.3}
+    )
+
+
+def test_a_single_method_or_task_is_no_comparison(write_run, write_mcp):
+    alone = [write_run(task, task=task, score=0.5) for task in ("heading", "carry")]
+    assert over_tasks(grouped(*alone)) == ([], {})
+    assert over_tasks(grouped(alone[0], write_mcp("mcp", score=0.5))) == ([], {})

@@ -1,0 +1,126 @@
+import math
+import re
+import shutil
+
+import pytest
+
+from torchrl_mcp.analysis.results import Damaged, Run, find_runs, read_run
+
+
+def test_runs_are_found_at_any_depth_and_each_once(write_run, tmp_path):
+    folders = [write_run("a"), write_run("b/c/d")]
+    runs, damaged = find_runs([tmp_path / "runs", tmp_path / "runs" / "b", folders[0]])
+    assert [run.path for run in runs] == folders
+    assert not damaged
+
+
+def test_a_run_knows_what_its_files_say(write_run):
+    folder = write_run("run", method="moe", task="carry", character="trex", stage="pretrain", seed=7, score=0.75)
+    run = read_run(folder)
+    assert (run.place, run.method, run.stage, run.seed) == (("carry", "trex"), "moe", "pretrain", 7)
+    assert (run.frames, run.total_frames, run.seconds) == (1000, 1000, 10.0)
+    assert (run.preset, run.commit) == ("fast", "abc1234")
+    assert run.evaluation["stochastic"]["normalised_return"] == pytest.approx(0.65)
+
+
+@pytest.mark.parametrize(
+    ("settings", "state"),
+    [
+        ({"score": 0.5}, "complete"),
+        ({}, "not evaluated"),
+        ({"progress": 0.5}, "unfinished"),
+        ({"progress": 0.5, "score": 0.5}, "unfinished"),
+        ({"progress": 0.0}, "unfinished"),
+    ],
+    ids=str,
+)
+def test_the_state_of_a_run_is_told(write_run, settings, state):
+    run = read_run(write_run("run", **settings))
+    assert run.state == state
+    assert run.progress == settings.get("progress", 1.0)
+    assert run.has_episodes == bool(run.progress)
+
+
+def test_a_run_without_origin_has_unknown_preset_and_commit(write_run):
+    run = read_run(write_run("run", preset=None, score=0.5))
+    assert (run.state, run.preset, run.commit) == ("complete", "unknown", "unknown")
+
+
+def test_a_run_whose_code_was_in_no_checkout_has_an_unknown_commit(write_run):
+    assert read_run(write_run("run", commit=None)).commit == "unknown"
+
+
+def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
+    folder = write_run("run")
+    rows = (folder / "metrics.csv").read_text().replace(",1,0.5", ",0,nan")
+    (folder / "metrics.csv").write_text(rows)
+    assert not read_run(folder).has_episodes
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "reason"),
+    [
+        ("metrics.csv", "iteration,frames\n1,many\n", "metrics.csv cannot be read: could not convert .*'many'"),
+        ("metrics.csv", "iteration,frames\n1,100\n", "metrics.csv cannot be read: it lacks 'seconds'"),
+        ("metrics.csv", b"\xff\xfe\xff", "metrics.csv cannot be read: .*decode"),
+        ("evaluation.json", '{"episodes": 1', "evaluation.json cannot be read: Expecting"),
+        ("evaluation.json", '{"deterministic": {}}', "evaluation.json cannot be read: it lacks 'normalised_return'"),
+        ("evaluation.json", "[]", "evaluation.json cannot be read"),
+        ("origin.json", "", "origin.json cannot be read: Expecting value"),
+        ("origin.json", '{"choices": []}', "origin.json cannot be read"),
+    ],
+)
+def test_a_damaged_file_is_named_with_the_reason(write_run, file, content, reason):
+    folder = write_run("run", score=0.5)
+    (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+    run = read_run(folder)
+    assert isinstance(run, Run)
+    assert run.state == "damaged"
+    assert run.settings["method.name"] == "scratch"
+    assert re.match(reason, run.fault), run.fault
+
+
+def test_a_return_that_is_no_number_is_a_damage(write_run):
+    run = read_run(write_run("run", score=math.nan))
+    assert run.fault == "evaluation.json cannot be read: the deterministic normalised return is nan"
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("method: [", "config.yaml cannot be read: while parsing"),
+        ("method: {name: mcp}", "config.yaml has no valid task.name, character.name, stage.name, seed, training"),
+        ("- 1", "config.yaml has no valid task.name"),
+        ("seed: ${nowhere}", "config.yaml cannot be read: .*nowhere"),
+    ],
+)
+def test_a_configuration_that_cannot_be_read_is_named_with_the_reason(write_run, content, reason):
+    folder = write_run("run", score=0.5)
+    (folder / "config.yaml").write_text(content)
+    damaged = read_run(folder)
+    assert isinstance(damaged, Damaged)
+    assert damaged.path == folder
+    assert re.match(reason, damaged.reason), damaged.reason
+
+
+def test_metrics_without_a_configuration_are_named(write_run, tmp_path):
+    folder = write_run("run")
+    (folder / "config.yaml").unlink()
+    assert find_runs([tmp_path]) == ([], [Damaged(folder, "has no config.yaml")])
+
+
+def test_a_run_that_is_to_take_no_steps_is_damaged(write_run):
+    assert read_run(write_run("run", total_frames=0)).reason.startswith("config.yaml has training.total_frames=0")
+
+
+def test_hidden_folders_hold_no_runs(write_run, tmp_path):
+    write_run("run")
+    shutil.copytree(tmp_path / "runs" / "run", tmp_path / "runs" / ".hydra")
+    assert len(find_runs([tmp_path])[0]) == 1
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_path_without_a_run_is_an_error(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=f"{name} holds no run"):
+        find_runs([tmp_path / name])

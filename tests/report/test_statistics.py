@@ -1,0 +1,59 @@
+import math
+
+import numpy as np
+import pytest
+
+from torchrl_mcp.analysis.statistics import Estimate, deviation, interquartile_mean, mean
+
+
+def test_the_mean_is_the_mean_and_the_deviation_that_of_a_sample():
+    assert mean([0.1, 0.2, 0.6]).value == pytest.approx(0.3)
+    assert deviation([0.1, 0.2, 0.6]) == pytest.approx(math.sqrt((0.04 + 0.01 + 0.09) / 2))
+
+
+def test_the_interval_of_three_values_is_their_range():
+    estimate = mean([0.4, 0.1, 0.2])
+    assert (estimate.low, estimate.high) == pytest.approx((0.1, 0.4))
+
+
+def test_the_interval_of_many_values_is_that_of_the_normal_distribution():
+    values = np.random.default_rng(1).normal(size=400)
+    half_width = 1.96 * values.std() / math.sqrt(400)
+    estimate = mean(list(values))
+    assert estimate.low == pytest.approx(values.mean() - half_width, abs=0.005)
+    assert estimate.high == pytest.approx(values.mean() + half_width, abs=0.005)
+
+
+def test_a_single_value_has_neither_deviation_nor_interval():
+    estimate = mean([0.5])
+    assert estimate.value == 0.5
+    assert all(map(math.isnan, (estimate.low, estimate.high, deviation([0.5]))))
+
+
+@pytest.mark.filterwarnings("error")
+def test_equal_values_have_an_interval_of_no_width():
+    assert mean([0.5, 0.5, 0.5]) == Estimate(0.5, 0.5, 0.5)
+
+
+def test_estimates_are_the_same_again():
+    values = list(np.linspace(0, 1, 7) ** 2)
+    assert mean(values) == mean(values)
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters_of_all_tasks_together():
+    assert interquartile_mean([[0, 7, 2, 5], [1, 6, 3, 400]]).value == pytest.approx((2 + 3 + 5 + 6) / 4)
+
+
+def test_tasks_that_differ_widen_no_interval_because_seeds_are_resampled_within_them():
+    estimate = interquartile_mean([[0.1, 0.1], [0.9, 0.9], [0.2, 0.2], [0.6, 0.6]])
+    assert (estimate.low, estimate.high) == (estimate.value, estimate.value) == pytest.approx((0.4, 0.4))
+
+
+def test_a_task_of_a_single_seed_leaves_nothing_to_resample():
+    assert math.isnan(interquartile_mean([[0.1, 0.2], [0.5]]).low)
+
+
+@pytest.mark.parametrize("strata", [[], [[]], [[0.1], []]], ids=str)
+def test_missing_values_are_an_error(strata):
+    with pytest.raises(ValueError, match="leave out what was not evaluated"):
+        interquartile_mean(strata)

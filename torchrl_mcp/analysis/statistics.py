@@ -1,0 +1,81 @@
+"""Point estimates over seeds, with bootstrap intervals by SciPy."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import bootstrap, trim_mean
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its uncertainty.
+
+    Attributes:
+        value: The number.
+        low: Lower end of its 95 % interval, NaN where there is nothing to resample.
+        high: Upper end.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+
+def mean(values: Sequence[float]) -> Estimate:
+    """Return the mean with its percentile bootstrap interval.
+
+    Of three values the interval is their range: one in 27 resamples holds the least of them three times.
+
+    Raises:
+        ValueError: If there is no value.
+    """
+    return _estimate([values], np.mean)
+
+
+def deviation(values: Sequence[float]) -> float:
+    """Return the standard deviation of a sample, over ``n - 1``; NaN of a single value."""
+    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+
+
+def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
+    """Return the mean of the middle half of all values, with a bootstrap interval that resamples within each stratum.
+
+    Args:
+        strata: Values by task, one per seed.
+
+    Raises:
+        ValueError: If a stratum has no value.
+
+    Reference:
+        Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", 2021,
+        https://arxiv.org/abs/2108.13264
+    """
+    return _estimate(strata, lambda values, axis: trim_mean(values, 0.25, axis=axis))
+
+
+def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str) -> dict[str, float]:
+    """Return the means of what all have, by name, but for names that begin with ``left_out``."""
+    shared = [name for name in (numbers[0] if numbers else {}) if all(name in other for other in numbers)]
+    kept = [name for name in shared if not name.startswith(left_out)]
+    return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
+
+
+def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray]) -> Estimate:
+    if not strata or not all(len(values) for values in strata):
+        raise ValueError(f"values={list(map(list, strata))} lack some: leave out what was not evaluated")
+    value = float(statistic(np.concatenate(strata), axis=0))
+    if any(len(values) < 2 for values in strata):
+        return Estimate(value)
+    interval = bootstrap(
+        strata,
+        lambda *samples, axis: statistic(np.concatenate(samples, axis=axis), axis=axis),
+        vectorized=True,
+        method="percentile",
+        confidence_level=CONFIDENCE,
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high))
