@@ -1,0 +1,232 @@
+"""Where characters go that explore at random: Figure 6.
+
+An *explorer* is a function from normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from torchrl_mcp.actors import Composition, DeterministicAction
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.evaluation import evaluate
+
+Array = NDArray[np.float64]
+
+Explorer = Callable[[Tensor], Tensor]
+
+UPRIGHT, FALLEN = COLOURS[0], COLOURS[1]
+
+SPACING = 0.2
+"""Seconds between the rows of a path in a table."""
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """Where characters went that began alike.
+
+    Attributes:
+        positions: Horizontal position of the root in metres from where it began, ``(T + 1, N, 2)``; NaN after the end.
+        ended: Whether each fell before the time was up, ``(N,)``.
+        timestep: Seconds between two positions.
+    """
+
+    positions: Array
+    ended: NDArray[np.bool_]
+    timestep: float
+
+    @property
+    def seconds(self) -> Array:
+        """How long each character stayed up, ``(N,)``."""
+        steps = np.isfinite(self.positions[..., 0]).sum(0) - 1
+        # The position of the last step of an episode is not known.
+        return (steps + 1) * self.timestep
+
+
+def fixed_weights(primitives: nn.Module, mixer: Composition, gates: Tensor) -> Explorer:
+    """Compose primitives with weights that are held, and play the composite's deterministic action.
+
+    Args:
+        primitives: From states to means and standard deviations, each ``(N, K, A)``.
+        mixer: Of ``(loc, scale, gates)``.
+        gates: Weights, shape ``(N, K)``.
+    """
+    composite = DeterministicAction(mixer)
+
+    def act(state: Tensor) -> Tensor:
+        loc, scale = primitives(state)
+        return composite(loc, scale, gates)
+
+    return act
+
+
+def fixed_latent(decoder: nn.Module, latent: Tensor) -> Explorer:
+    """Decode a latent variable that is held, and play the mean action.
+
+    Args:
+        decoder: From states and latent variables to means and standard deviations, each ``(N, A)``.
+        latent: Shape ``(N, L)``.
+    """
+    return lambda state: decoder(state, latent)[0]
+
+
+class RandomSequence:
+    """Lets one primitive act after the other in random order, each for as many steps, and plays mean actions.
+
+    Args:
+        primitives: From states and the options that act, ``(N,)``, to means and standard deviations, each ``(N, A)``.
+        num_options: Number of primitives.
+        steps: For which one acts.
+        generator: Source of randomness.
+    """
+
+    def __init__(
+        self,
+        primitives: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        *,
+        num_options: int,
+        steps: int,
+        generator: torch.Generator,
+    ) -> None:
+        self._primitives, self._num_options, self._steps, self._generator = primitives, num_options, steps, generator
+        self._elapsed, self._option = 0, torch.zeros(0, dtype=torch.int64)
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Return actions for the next step."""
+        if self._elapsed % self._steps == 0:
+            self._option = torch.randint(self._num_options, state.shape[:1], generator=self._generator)
+        self._elapsed += 1
+        return self._primitives(state, self._option)[0]
+
+
+def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> Explorer:
+    """Play Gaussian noise about the action 0, which for characters under PD control is their rest pose.
+
+    Args:
+        action_dim: Size of the action, ``A``.
+        std: Of the noise, in action units.
+        generator: Source of randomness.
+    """
+    return lambda state: std * torch.randn(len(state), action_dim, generator=generator)
+
+
+def explore(
+    explorer: Explorer, normaliser: Callable[[Tensor], Tensor], env: CharacterEnv, start: TensorDictBase
+) -> Exploration:
+    """Play one episode in each environment.
+
+    Args:
+        explorer: What acts.
+        normaliser: From states as observed to those that the explorer sees.
+        env: Environments whose episodes end by a fall or the time limit.
+        start: State in which all begin.
+    """
+    policy = TensorDictModule(
+        lambda observation: explorer(normaliser(observation)), in_keys=["observation"], out_keys=["action"]
+    )
+    outcome = evaluate(policy, env, start=start)
+    origin = start["qpos"][:, :2]
+    positions = torch.cat([origin.unsqueeze(0), outcome.positions]) - origin
+    return Exploration(positions.numpy(), outcome.terminated.numpy(), env.control_timestep)
+
+
+def summary(exploration: Exploration) -> dict[str, float]:
+    """Say how far exploration leads.
+
+    ``upright`` is the share of characters that did not fall, ``seconds`` the median time until they did or the time was
+    up, ``distance`` the median of the greatest distance from the origin in metres, and ``spread`` the circular variance
+    of the directions in which characters last were, 0 where all went the same way and 1 where they went all ways alike.
+    """
+    distances = np.linalg.norm(exploration.positions, axis=-1)
+    angles = np.arctan2(*_last(exploration.positions).T[::-1])
+    return {
+        "trajectories": len(exploration.ended),
+        "upright": float(1 - exploration.ended.mean()),
+        "seconds": float(np.median(exploration.seconds)),
+        "distance": float(np.median(np.nanmax(distances, axis=0))),
+        "spread": float(1 - np.abs(np.exp(1j * angles).mean())),
+    }
+
+
+def path_rows(exploration: Exploration) -> list[dict[str, float]]:
+    """Return where every character was, every :data:`SPACING` seconds until its end."""
+    every = max(1, round(SPACING / exploration.timestep))
+    return [
+        {"trajectory": number, "seconds": round(step * exploration.timestep, 3), "x": round(x, 3), "y": round(y, 3)}
+        for number, path in enumerate(exploration.positions.swapaxes(0, 1), start=1)
+        for step, (x, y) in enumerate(path.tolist())
+        if step % every == 0 and np.isfinite(x)
+    ]
+
+
+def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure:
+    """Draw paths from above, each panel under its name, all on one scale, and enlarged where they are short.
+
+    Args:
+        panels: By name.
+        title: Says who explores.
+    """
+    points = np.concatenate([panel.positions.reshape(-1, 2) for panel in panels.values()])
+    low, high = np.nanmin(points, 0), np.nanmax(points, 0)
+    half = 0.53 * max((high - low).max(), 1e-3)
+    limits = np.stack([(low + high) / 2 - half, (low + high) / 2 + half], -1)
+    figure = new_figure(3.2 * len(panels), 4.5)
+    figure.suptitle(title, fontsize=11, color=INK)
+    grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    for axes, (name, panel) in zip(grid, panels.items(), strict=True):
+        _draw_paths(axes, panel)
+        axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
+        axes.set_title(f"{name}\n{_outcome(panel)}", fontsize=9, color=INK)
+        axes.set_xlabel("forward (m)", fontsize=9)
+        axes.grid(color="#EEEEEE")
+        axes.set_axisbelow(True)
+        bare(axes)
+        if (reach := float(np.nanmax(np.abs(panel.positions)))) < 0.25 * half:
+            _enlarge(axes, panel, 1.1 * reach)
+    grid[0].set_ylabel("to the left (m)", fontsize=9)
+    handles = [
+        Line2D([], [], color=UPRIGHT, linewidth=1.4, label="upright to the end"),
+        Line2D([], [], color=FALLEN, linewidth=1.4, marker="x", markersize=5, label="fell"),
+        Line2D([], [], color=INK, linewidth=0, marker="o", markersize=4, label="start, facing forward"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def _outcome(panel: Exploration) -> str:
+    numbers = summary(panel)
+    return f"{numbers['upright']:.0%} upright, median {numbers['seconds']:.1f} s, reach {numbers['distance']:.1f} m"
+
+
+def _draw_paths(axes: Axes, panel: Exploration, width: float = 1.0) -> None:
+    for path, fell in zip(panel.positions.swapaxes(0, 1), panel.ended, strict=True):
+        axes.plot(*path.T, color=FALLEN if fell else UPRIGHT, linewidth=width, alpha=0.75, solid_capstyle="round")
+    x, y = _last(panel.positions)[panel.ended].T
+    axes.scatter(x, y, s=12, marker="x", color=FALLEN, linewidths=0.8, zorder=3)
+    axes.scatter(0.0, 0.0, s=14, color=INK, linewidths=0, zorder=4)
+
+
+def _enlarge(axes: Axes, panel: Exploration, limit: float) -> None:
+    inset = axes.inset_axes((0.6, 0.62, 0.38, 0.38))
+    _draw_paths(inset, panel, 0.6)
+    inset.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    inset.locator_params(nbins=3)
+    inset.tick_params(labelsize=7, labelcolor=INK, color=FAINT)
+    inset.spines[:].set_color(FAINT)
+    axes.indicate_inset_zoom(inset, edgecolor=INK, linewidth=0.8)
+
+
+def _last(positions: Array) -> Array:
+    """The last known position of every path, ``(N, 2)``."""
+    last = np.isfinite(positions[..., 0]).sum(0) - 1
+    return positions[last, np.arange(positions.shape[1])]

@@ -1,0 +1,72 @@
+"""Strides and their phases, found from the feet on the ground and from nothing that a reference motion says."""
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.kinematics import body_names
+from torchrl_mcp.envs.pd_character import PDCharacterEnv, falling_geoms, lowest_points
+
+CLEARANCE = 0.003
+"""Metres below which a foot stands: one that has just touched down bounces by less."""
+
+STEADY = 7
+"""Control steps, odd. Of that many, more than half decide whether a foot stands: shorter flickers are none."""
+
+
+class Feet:
+    """Tells which feet of characters stand on the ground.
+
+    Args:
+        env: The characters. Only shapes of their feet and how they lie are looked at.
+    """
+
+    def __init__(self, env: PDCharacterEnv) -> None:
+        model, feet = env.simulation.model, env.character.feet
+        bodies = body_names(env.character.name)
+        others = tuple(body for body in bodies if body not in feet)
+        self._geoms, self._half_sizes, self._radii = falling_geoms(model, others, len(bodies))
+        owners = torch.from_numpy(model.geom_bodyid[self._geoms.numpy()])
+        self._shapes = [owners == model.body(foot).id for foot in feet]
+        self._outputs = env.simulation.outputs
+
+    def standing(self) -> Tensor:
+        """Whether the right and the left foot stand, as they are now, ``(N, 2)``, bool."""
+        heights = self._outputs["geom_xpos"][:, self._geoms, 2]
+        vertical = self._outputs["geom_xmat"][:, self._geoms, 6:]
+        down = lowest_points(heights, vertical, self._half_sizes, self._radii) < CLEARANCE
+        return torch.stack([down[:, shapes].any(-1) for shapes in self._shapes], -1)
+
+
+def stride_phases(standing: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return where in its stride a walker is: 0 where the right foot touches down, and 1 where it does again.
+
+    A stride in which the left foot does not touch down exactly once is none.
+
+    Args:
+        standing: Whether the right and the left foot stand, one row per control step, ``(T, 2)``.
+
+    Returns:
+        Phases in [0, 1), ``(T,)``; NaN outside of complete strides.
+    """
+    right, left = (touch_downs(foot) for foot in np.asarray(standing).T)
+    phases = np.full(len(standing), np.nan)
+    for start, stop in pairwise(right.tolist()):
+        if np.count_nonzero((left >= start) & (left < stop)) == 1:
+            phases[start:stop] = np.arange(stop - start) / (stop - start)
+    return phases
+
+
+def touch_downs(standing: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the steps in which a foot begins to stand; it does so for most of :data:`STEADY` steps around each.
+
+    Args:
+        standing: Whether it stands, ``(T,)``.
+    """
+    around = sliding_window_view(np.pad(standing, STEADY // 2, mode="edge"), STEADY)
+    steady = around.sum(-1) > STEADY // 2
+    return np.flatnonzero(steady[1:] & ~steady[:-1]) + 1

@@ -1,0 +1,134 @@
+r"""Do primitives specialise? Numbers beside Figure 7: how weights follow the walk cycle, how far actions are apart.
+
+Samples are rows; ``K`` counts primitives, ``A`` actions, ``M`` samples.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PHASE_BINS = 20
+"""Of a stride."""
+
+
+def bin_means(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> Array:
+    """Return the mean in each of ``num_bins`` equal bins of the phase, ``(num_bins, K)``; NaN where there is none.
+
+    Args:
+        values: Shape ``(M, K)``.
+        phases: In [0, 1), shape ``(M,)``.
+        num_bins: Number of bins.
+    """
+    bins = (phases * num_bins).astype(int)
+    counts = np.bincount(bins, minlength=num_bins)[:, None]
+    sums = np.stack([np.bincount(bins, column, minlength=num_bins) for column in values.T], -1)
+    return np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+
+
+def explained_by_phase(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> tuple[Array, float]:
+    r"""Return the share of variance that the phase explains, whatever the shape of the dependence.
+
+    .. math:: \eta^2_k = \frac{\mathrm{Var}\left[\mathrm{E}[w_k | \phi]\right]}{\mathrm{Var}[w_k]}
+
+    Args:
+        values: Weights w, shape ``(M, K)``.
+        phases: In [0, 1), shape ``(M,)``.
+        num_bins: Bins within which the mean counts as constant.
+
+    Returns:
+        Of each column, ``(K,)``, 0 where it does not vary; and of all together, in which a column counts by its
+        variance.
+    """
+    deviation = values - values.mean(0)
+    predicted = bin_means(deviation, phases, num_bins)[(phases * num_bins).astype(int)]
+    explained, total = np.square(predicted).sum(0), np.square(deviation).sum(0)
+    return _ratio(explained, total), float(_ratio(explained.sum(), total.sum()))
+
+
+def circular_correlation(values: Array, phases: Array) -> Array:
+    r"""Return the squared correlation of each column with a wave of one period per stride, ``(K,)``.
+
+    .. math:: R^2 = 1 - \min_{a, b, c} \frac{\sum (w - a - b \cos 2 \pi \phi - c \sin 2 \pi \phi)^2}
+        {\sum (w - \bar w)^2}
+
+    Args:
+        values: Weights w, shape ``(M, K)``.
+        phases: In [0, 1), shape ``(M,)``.
+
+    Reference:
+        Mardia, Linear-circular correlation coefficients and rhythmometry, 1976, https://doi.org/10.1093/biomet/63.2.403
+    """
+    angle = 2 * np.pi * phases
+    waves = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], -1)
+    fitted = waves @ np.linalg.lstsq(waves, values, rcond=None)[0]
+    return _ratio(np.square(fitted - values.mean(0)).sum(0), np.square(values - values.mean(0)).sum(0))
+
+
+def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
+    """Return the correlation of each column with left minus right foot on the ground, ``(K,)``.
+
+    1 is a weight that is high where the left foot alone stands and low where the right one does, -1 the opposite.
+
+    Args:
+        values: Weights, shape ``(M, K)``.
+        standing: Whether the right and the left foot stand, shape ``(M, 2)``.
+    """
+    side = standing[:, 1].astype(float) - standing[:, 0]
+    side, values = side - side.mean(), values - values.mean(0)
+    norms = np.sqrt(np.square(side).sum() * np.square(values).sum(0))
+    return _ratio(side @ values, norms)
+
+
+def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
+    """Return the actions in the directions in which they vary most, ``(M, num)``, and their shares of the variance.
+
+    Args:
+        actions: Shape ``(M, A)``.
+        num: Number of directions.
+    """
+    centred = actions - actions.mean(0)
+    _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
+    return centred @ directions[:num].T, np.square(sizes[:num]) / np.square(sizes).sum()
+
+
+def between_primitives(actions: Array) -> float:
+    """Return the share of the variance of actions that lies between the primitives' own means.
+
+    Args:
+        actions: Mean action of every primitive in the same states, shape ``(M, K, A)``.
+    """
+    deviation = actions - actions.mean((0, 1))
+    return float(np.square(deviation.mean(0)).sum() * len(actions) / np.square(deviation).sum())
+
+
+def silhouettes(actions: Array) -> Array:
+    r"""Return how much closer actions are to those of their own primitive than of the nearest other one, ``(K,)``.
+
+    .. math:: s = \frac{b - a}{\max(a, b)}
+
+    with a the mean distance of an action from the others of its primitive and b that from the actions of the nearest
+    other one; means over the actions of each primitive. 1 is well apart, 0 on the border, below 0 among others.
+
+    Args:
+        actions: Mean action of every primitive in the same states, shape ``(M, K, A)``, M at least 2.
+
+    Reference:
+        Rousseeuw, Silhouettes, 1987, https://doi.org/10.1016/0377-0427(87)90125-7
+    """
+    num_states, num_primitives, _ = actions.shape
+    points = actions.swapaxes(0, 1).reshape(num_states * num_primitives, -1)
+    squares = np.square(points).sum(-1)
+    distances = np.sqrt((squares[:, None] + squares - 2 * points @ points.T).clip(min=0.0))
+    np.fill_diagonal(distances, 0.0)
+    sums = distances.reshape(num_primitives, num_states, num_primitives, num_states).sum(-1)
+    own = np.arange(num_primitives)
+    within = sums[own, :, own] / (num_states - 1)
+    sums[own, :, own] = np.inf
+    nearest = sums.min(-1) / num_states
+    return _ratio(nearest - within, np.maximum(within, nearest)).mean(-1)
+
+
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    """Return quotients, 0 where the denominator is."""
+    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0)

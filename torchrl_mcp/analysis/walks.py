@@ -1,0 +1,213 @@
+"""What gate and primitives do in a walk, and how far they specialise: the numbers of Figure 7."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp.actors import PRIMITIVES
+from torchrl_mcp.analysis.gait import Feet, stride_phases
+from torchrl_mcp.analysis.specialisation import (
+    PHASE_BINS,
+    between_primitives,
+    bin_means,
+    circular_correlation,
+    explained_by_phase,
+    principal_components,
+    silhouettes,
+    stance_correlation,
+)
+from torchrl_mcp.envs import Imitation
+
+Array = NDArray[np.float64]
+
+STATES = 100
+"""Of which actions are drawn and compared: evenly spread over the walk."""
+
+GOLDEN = 0.6180339887498949
+"""Fractional part of the golden ratio: its multiples spread evenly over a cycle, however many there are."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """What a policy did in the complete strides of a walk, sample by sample.
+
+    Attributes:
+        phases: Of the stride, 0 where the right foot touches down, in [0, 1), ``(M,)``.
+        standing: Whether the right and the left foot stand, ``(M, 2)``.
+        gates: Weights of the primitives, ``(M, K)``.
+        actions: Mean actions of the primitives, ``(M, K, A)``.
+        inputs: What the policy saw, ``observation`` and ``goal``, batch size ``(M,)``.
+        strides: Number of strides.
+        seconds: Mean duration of a stride.
+    """
+
+    phases: Array
+    standing: NDArray[np.bool_]
+    gates: Array
+    actions: Array
+    inputs: TensorDict
+    strides: int
+    seconds: float
+
+
+def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float = 10.0) -> Walk:
+    """Let characters follow the first reference motion from moments spread over it, and keep their complete strides.
+
+    A character counts until it falls or loses its reference.
+
+    Args:
+        policy: From ``observation`` and ``goal`` to ``action``, ``gates`` and ``primitives``; it plays its
+            deterministic action.
+        env: Imitation without changes of the reference.
+        seconds: Duration of the walk.
+
+    Raises:
+        ValueError: If there is no complete stride.
+    """
+    moments = env.library.durations[0] * (GOLDEN * torch.arange(env.num_envs, dtype=torch.float64) % 1)
+    clips = torch.zeros(env.num_envs, dtype=torch.int64)
+    env.reset()
+    state = env.reset(env.get_state().update(TensorDict(env.beginning(clips, moments), env.batch_size)), set_state=True)
+    feet, running, steps = Feet(env), torch.ones(env.num_envs, dtype=torch.bool), []
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(round(seconds / env.control_timestep)):
+            decision = policy(state.select("observation", "goal"))
+            steps.append(
+                decision.select("observation", "goal", "gates", PRIMITIVES[0]).update(
+                    {"standing": feet.standing(), "running": running.clone()}
+                )
+            )
+            step, state = env.step_and_maybe_reset(state.update(decision))
+            running &= ~step["next", "done"].squeeze(-1)
+            if not running.any():
+                break
+    return complete_strides(TensorDict.stack(steps, 1), env.control_timestep)
+
+
+def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
+    """Find the strides of walkers and put what belongs to them in a row.
+
+    Args:
+        steps: ``observation``, ``goal``, ``gates``, ``primitives``, ``standing`` and whether that still counts,
+            ``running``, of N walkers, batch size ``(N, T)``.
+        timestep: Seconds per step.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    walkers = [walker[walker["running"]] for walker in steps.unbind(0)]
+    phases = [stride_phases(walker["standing"].numpy()) for walker in walkers]
+    whole = [np.isfinite(phase) for phase in phases]
+    strides = sum(int((phase == 0).sum()) for phase in phases)
+    if not strides:
+        raise ValueError(
+            "the walk has no complete stride, in which one foot touches down between two touch-downs of the other: "
+            "take a policy that can walk"
+        )
+    kept = TensorDict.cat([walker[torch.from_numpy(inside)] for walker, inside in zip(walkers, whole, strict=True)], 0)
+    return Walk(
+        phases=np.concatenate([phase[inside] for phase, inside in zip(phases, whole, strict=True)]),
+        standing=kept["standing"].numpy(),
+        gates=kept["gates"].double().numpy(),
+        actions=kept[PRIMITIVES[0]].double().numpy(),
+        inputs=kept.select("observation", "goal"),
+        strides=strides,
+        seconds=len(kept) * timestep / strides,
+    )
+
+
+def specialisation(walk: Walk) -> dict[str, float]:
+    """Return how far a policy's primitives specialise.
+
+    ``phase`` is the share of the variance of all weights that the phase of the stride explains, ``swing`` the mean
+    difference between the greatest and the least weight of a primitive over the cycle, ``left`` and ``right`` the
+    strongest correlation with standing on that foot, ``between`` the share of the variance of mean actions that is
+    between primitives, and ``silhouette`` the mean of :func:`~torchrl_mcp.analysis.specialisation.silhouettes`.
+    """
+    stance = stance_correlation(walk.gates, walk.standing)
+    return {
+        "phase": explained_by_phase(walk.gates, walk.phases)[1],
+        "swing": float(swings(walk).mean()),
+        "left": float(stance.max()),
+        "right": float(-stance.min()),
+        "between": between_primitives(_few(walk.actions)),
+        "silhouette": float(silhouettes(_few(walk.actions)).mean()),
+    }
+
+
+def swings(walk: Walk) -> Array:
+    """Return the difference between the greatest and the least mean weight over the cycle, ``(K,)``."""
+    means = bin_means(walk.gates, walk.phases)
+    return np.nanmax(means, 0) - np.nanmin(means, 0)
+
+
+def primitive_rows(walk: Walk) -> list[dict[str, float]]:
+    """Return a row of numbers for every primitive, counted from 1."""
+    columns = {
+        "weight": walk.gates.mean(0),
+        "swing": swings(walk),
+        "explained_by_phase": explained_by_phase(walk.gates, walk.phases)[0],
+        "circular_r2": circular_correlation(walk.gates, walk.phases),
+        "stance_correlation": stance_correlation(walk.gates, walk.standing),
+        "silhouette": silhouettes(_few(walk.actions)),
+    }
+    return [
+        {"primitive": number, **dict(zip(columns, map(float, row), strict=True))}
+        for number, row in enumerate(zip(*columns.values(), strict=True), start=1)
+    ]
+
+
+def cycle_rows(walk: Walk) -> list[dict[str, float]]:
+    """Return for every bin of the cycle the shares of time in which feet stand, and the weights of the primitives.
+
+    ``low`` and ``high`` hold nine tenths of the samples between them.
+    """
+    bins = (walk.phases * PHASE_BINS).astype(int)
+    feet = bin_means(walk.standing.astype(float), walk.phases)
+    rows = []
+    for index in np.unique(bins):
+        gates, (right, left) = walk.gates[bins == index], feet[index]
+        spread = zip(gates.mean(0), *np.quantile(gates, [0.05, 0.95], axis=0), strict=True)
+        rows += [
+            {
+                "primitive": number,
+                "phase": (index + 0.5) / PHASE_BINS,
+                "mean": float(mean),
+                "low": float(low),
+                "high": float(high),
+                "right_foot": float(right),
+                "left_foot": float(left),
+            }
+            for number, (mean, low, high) in enumerate(spread, start=1)
+        ]
+    return rows
+
+
+def action_rows(walk: Walk) -> list[dict[str, float]]:
+    """Return the mean actions of all primitives, in the same states, in the plane of their principal components."""
+    scores, _ = plane(walk)
+    return [
+        {"state": state, "primitive": number, "component_1": float(one), "component_2": float(two)}
+        for state, points in enumerate(scores, start=1)
+        for number, (one, two) in enumerate(points, start=1)
+    ]
+
+
+def plane(walk: Walk) -> tuple[Array, Array]:
+    """Return mean actions in their first two principal components, ``(STATES, K, 2)``, and their shares, ``(2,)``.
+
+    A share is one of the variance of the mean actions of all primitives.
+    """
+    actions = _few(walk.actions)
+    scores, shares = principal_components(actions.reshape(-1, actions.shape[-1]))
+    return scores.reshape(*actions.shape[:2], 2), shares
+
+
+def _few(samples: Array) -> Array:
+    """At most :data:`STATES` of the samples, evenly spread."""
+    return samples[np.linspace(0, len(samples) - 1, min(STATES, len(samples))).round().astype(int)]
