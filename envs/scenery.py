@@ -53,12 +53,9 @@ def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
     model.vis.map.fogstart, model.vis.map.fogend = np.array([5.0, 15.0]) / model.stat.extent
     model.vis.map.shadowclip = 35.0 / model.stat.extent  # where the map of shadows ends the ground is speckled
     model.mat_reflectance[:] = 0
-    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+    for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).tolist():
         _extend(model, plane)
-        texture = model.mat_texid[model.geom_matid[plane], mujoco.mjtTextureRole.mjTEXROLE_RGB]
-        size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
-        pixels = model.tex_data[model.tex_adr[texture] :][:size]
-        pixels[:] = pixels.clip(*GROUND)
+        _fade(model, plane)
     return model
 
 
@@ -74,7 +71,17 @@ def reach(model: mujoco.MjModel) -> float:
 def _extend(model: mujoco.MjModel, plane: int) -> None:
     """Make a plane endless, with its pattern as it was: MuJoCo draws haze on large finite ones as if they were far."""
     size, material = model.geom_size[plane, :2], model.geom_matid[plane]
-    if (size > 0).all() and not model.mat_texuniform[material]:
+    if material >= 0 and (size > 0).all() and not model.mat_texuniform[material]:
         model.mat_texrepeat[material] /= size
         model.mat_texuniform[material] = True
     size[:] = 0
+
+
+def _fade(model: mujoco.MjModel, plane: int) -> None:
+    """Bring the pixels of a plane's pattern into the range of :data:`GROUND`."""
+    material = model.geom_matid[plane]
+    texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
+    if texture >= 0:
+        size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+        pixels = model.tex_data[model.tex_adr[texture] :][:size]
+        pixels[:] = pixels.clip(*GROUND)

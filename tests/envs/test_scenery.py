@@ -132,3 +132,8 @@ def test_softly_lit_ground_is_pale_and_endless_and_mirrors_nothing():
     assert np.array_equal(np.delete(lit.tex_data, slice(start, end)), np.delete(model.tex_data, slice(start, end)))
     assert not lit.mat_reflectance.any()
     assert not lit.geom_size[floor, :2].any()
+
+
+def test_a_plain_ground_can_be_softly_lit_too():
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom type='plane' size='9 9 1'/></worldbody></mujoco>")
+    assert not softly_lit(model).geom_size[0, :2].any()

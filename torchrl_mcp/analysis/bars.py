@@ -1,0 +1,33 @@
+"""Weights of primitives as bars in a corner of a picture."""
+
+from collections.abc import Sequence
+
+from PIL import Image, ImageDraw, ImageFont
+
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK
+
+ROW, LENGTH = 1 / 22, 1 / 4
+"""Height of a bar's row and length of a bar of weight 1, both relative to the height of the picture."""
+
+
+def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> None:
+    """Draw numbered bars into the upper left corner, as long as weights from 0 to 1, each on a track of length 1.
+
+    Args:
+        picture: An RGB picture, which is changed.
+        weights: From 0 to 1, of primitives 1, 2, ...
+        title: What they are.
+    """
+    draw, row, length = ImageDraw.Draw(picture), round(picture.height * ROW), round(picture.height * LENGTH)
+    font = ImageFont.load_default(0.8 * row)
+    left, top, gap = 2 * row, 2 * row, max(1, row // 6)
+    plate = (row // 2, row // 3, left + length + row // 2, top + len(weights) * row + row // 3)
+    corner = picture.crop(plate)
+    picture.paste(Image.blend(corner, Image.new("RGB", corner.size, "white"), 0.6), plate)
+    draw.text((row, row), title, fill=INK, font=font, anchor="lm")
+    for number, weight in enumerate(weights):
+        colour, y = COLOURS[number % len(COLOURS)], top + number * row
+        draw.text((1.5 * row, y + row / 2), str(number + 1), fill=INK, font=font, anchor="mm")
+        for fill, right in ((FAINT, length), (colour, round(length * min(max(weight, 0.0), 1.0)))):
+            if right:
+                draw.rectangle((left, y + gap, left + right - 1, y + row - gap), fill=fill)
