@@ -7,7 +7,7 @@ TREE := build/tree
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-slow check format bench tree clean
+.PHONY: help demo install test test-slow check docs linkcheck format bench tree clean
 
 help:
 	@echo "make demo       install, then run the demonstration"
@@ -15,6 +15,8 @@ help:
 	@echo "make test       every test but the learning tests"
 	@echo "make test-slow  the learning tests"
 	@echo "make check      format, lint, types, doctests"
+	@echo "make docs       the documentation, in docs/_build/html"
+	@echo "make linkcheck  whether the sites that it links to are there"
 	@echo "make format     rewrite the code as 'make check' wants it"
 	@echo "make bench      throughput measurements"
 	@echo "make clean      remove builds and caches (.venv and runs stay)"
@@ -52,6 +54,17 @@ check: $(STAMP) tree
 	cd $(TREE) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p torchrl_mcp
 	cd $(TREE) && PYTHONPATH=. OMP_NUM_THREADS=1 ../../$(BIN)/pytest --doctest-modules torchrl_mcp
 
+DOCS := .venv/.docs
+$(DOCS): $(STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs]'
+	touch $@
+
+docs: $(DOCS)
+	$(BIN)/python -m sphinx -E -W --keep-going -b html docs docs/_build/html
+
+linkcheck: $(DOCS)
+	$(BIN)/python -m sphinx -E -b linkcheck docs docs/_build/linkcheck
+
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -60,5 +73,5 @@ bench: $(STAMP)
 	for name in throughput training_throughput primitive_reuse; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean:
-	rm -rf build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find torchrl_mcp envs conf tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true

@@ -1,0 +1,63 @@
+"""What our docstrings and classes have and Sphinx would take for something else."""
+
+import inspect
+import re
+from itertools import groupby
+from typing import Any
+
+from docutils import nodes
+from sphinx.application import Sphinx
+
+BEFORE_NAPOLEON = 400
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Prepare docstrings before they are parsed."""
+    app.setup_extension("sphinx.ext.autodoc")
+    app.connect("autodoc-process-docstring", prepare, priority=BEFORE_NAPOLEON)
+    app.connect("autodoc-process-signature", constructor)
+    app.connect("doctree-read", without_object)
+    return {"parallel_read_safe": True}
+
+
+def prepare(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Change the ``lines`` of a docstring in place.
+
+    Markdown tables become list-tables. Where a value is described, Napoleon takes what stands before a colon in the
+    first line for its type, unless nothing follows: the line is broken there.
+    """
+    if what in ("attribute", "data", "property") and lines:
+        lines[:1] = re.sub(r"^((?:[^`:]|`[^`]*`)*:) ", r"\1\n", lines[0]).split("\n")
+    converted: list[str] = []
+    for is_table, group in groupby(lines, key=lambda line: line.lstrip().startswith("|")):
+        block = list(group)
+        converted += list_table(block) if is_table else block
+    lines[:] = converted
+
+
+def constructor(
+    app: Sphinx, what: str, name: str, obj: Any, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Return a class's own arguments where TorchRL's metaclasses hide them."""
+    if what != "class" or signature != "(*args, **kwargs)":
+        return signature, returns
+    parameters = list(inspect.signature(obj.__init__).parameters.values())[1:]
+    bare = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in parameters]
+    return str(inspect.Signature(bare)), None
+
+
+def without_object(app: Sphinx, document: nodes.document) -> None:
+    """Leave out that a class derives from what all classes derive from."""
+    for paragraph in list(document.findall(nodes.paragraph)):
+        if paragraph.astext() == "Bases: object":
+            paragraph.parent.remove(paragraph)
+
+
+def list_table(rows: list[str]) -> list[str]:
+    """Return the lines of a list-table for those of a Markdown table: a header, a rule and rows."""
+    indent = rows[0][: len(rows[0]) - len(rows[0].lstrip())]
+    header, _, *body = ([cell.strip() for cell in row.strip().strip("|").split("|")] for row in rows)
+    lines = [".. list-table::", "   :header-rows: 1", ""]
+    for cells in (header, *body):
+        lines += [f"   {'  -' if column else '* -'} {cell}".rstrip() for column, cell in enumerate(cells)]
+    return [indent + line if line else "" for line in ["", *lines, ""]]

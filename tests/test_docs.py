@@ -1,0 +1,158 @@
+"""What the documentation shows works, and what it names exists."""
+
+import doctest
+import importlib
+import inspect
+import re
+import shlex
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_mcp import experiment
+from torchrl_mcp.envs.characters import CHARACTERS
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+TUTORIALS = [DOCS / "index.md", *sorted((DOCS / "tutorials").glob("*.md"))]
+PACKAGES = {"torchrl_mcp": ROOT / "torchrl_mcp", "torchrl_mcp.envs": ROOT / "envs"}
+
+BLOCK = re.compile(r"^```(python|pycon)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+FILE = re.compile(r"^```\{code-block\} \w+\n:caption: (.*?)\n\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+COMMAND = re.compile(r"^(?:PYTHONPATH=\. )?torchrl-mcp-train (.*)$", re.MULTILINE)
+INCLUDE = re.compile(r"```\{include\} (\S+)\n(.*?)```", re.DOTALL)
+
+EVERYTHING = (
+    "method=mcp task=holdout",
+    "method=mcp task=imitation character=biped",
+    "method=mcp task=heading character=biped stage=transfer",
+    "method=mcp task=carry character=biped stage=transfer",
+    "method=mcp exploration=weights stage=transfer",
+    "method=mcp preset=paper",
+    "method=hierarchical task=heading character=biped stage=transfer",
+    "method=option_critic task=imitation character=biped",
+    "method=latent_space task=imitation character=biped",
+    "method=finetune task=imitation character=biped",
+)
+"""Commands whose configurations hold every setting between them."""
+
+
+def pages_with(pattern):
+    pages = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
+    return [page for page in pages if pattern.search(page.read_text())]
+
+
+def composed(arguments):
+    """The configuration that a command would run, the first of several; Hydra refuses what does not exist."""
+    words = [word for word in shlex.split(arguments, comments=True) if not word.startswith("hydra")]
+    overrides = [re.sub(r"(?<==)([\w.]+),.*", r"\1", word) for word in words if "=" in word]
+    if of_own_files(arguments):
+        overrides.append(f"hydra.searchpath=[file://{Path('own').absolute()}]")
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", [*overrides, "run_dir=runs/never"], return_hydra_config=True)
+
+
+def of_own_files(arguments):
+    return "--config-dir own" in arguments or "hydra.searchpath" in arguments
+
+
+def run(tutorial, namespace):
+    """Execute all Python of a tutorial in one namespace; examples with a prompt must print what they show."""
+    text = tutorial.read_text()
+    for block in BLOCK.finditer(text):
+        kind, code = block.groups()
+        line = text.count("\n", 0, block.start()) + 1
+        if kind == "python":
+            exec(compile("\n" * line + code, str(tutorial), "exec"), namespace)
+        else:
+            example = doctest.DocTestParser().get_doctest(code, namespace, tutorial.name, str(tutorial), line)
+            doctest.DebugRunner().run(example, clear_globs=False)
+            namespace.update(example.globs)
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_the_code_of_a_tutorial_runs_from_top_to_bottom_and_its_commands_find_it(tutorial, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(CHARACTERS, "bench", None)  # is taken out again afterwards
+    module = ModuleType("bench")
+    module.__file__ = str(tmp_path / "bench.py")
+    monkeypatch.setitem(sys.modules, "bench", module)
+    text = tutorial.read_text()
+    for name, content in FILE.findall(text):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(content)
+
+    run(tutorial, module.__dict__)
+
+    for arguments in filter(of_own_files, COMMAND.findall(text)):
+        cfg = composed(arguments)
+        env = experiment.make_env(cfg, num_envs=2, seed=0)
+        policy = experiment.make_agent(cfg, env).actor.policy
+        with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
+            assert env.rollout(2, policy)["next", "reward"].isfinite().all()
+
+
+@pytest.mark.parametrize("page", pages_with(COMMAND), ids=lambda path: path.stem)
+def test_every_training_command_names_settings_that_exist(page):
+    for arguments in COMMAND.findall(page.read_text()):
+        if not of_own_files(arguments):
+            assert composed(arguments).method.name
+
+
+@pytest.fixture(scope="module")
+def configurations():
+    return [composed(choices) for choices in EVERYTHING]
+
+
+@pytest.mark.parametrize("page", ["silent", "differences"])
+def test_every_setting_that_a_table_names_is_in_the_configuration(page, configurations):
+    rows = [row.strip("|").split("|") for row in (DOCS / f"{page}.md").read_text().splitlines() if row.startswith("| ")]
+    names = {name for row in rows for name in re.findall(r"`(\+?[\w.]+)`", row[-1])}
+    assert len(names) > 5
+    for name in names - set(configurations[0].hydra.runtime.choices):
+        assert any(exists(cfg, name) for cfg in configurations), name
+
+
+def exists(cfg, name):
+    """Whether a setting is in a configuration, be its value null; or, after a plus, an argument of what it makes."""
+    *path, last = name.removeprefix("+").split(".")
+    parent = OmegaConf.select(cfg, ".".join(path)) if path else cfg
+    if not isinstance(parent, DictConfig):
+        return False
+    if not name.startswith("+"):
+        return last in parent
+    classes = getattr(get_object(parent._target_), "__mro__", ())
+    return last not in parent and any(last in inspect.signature(kind.__init__).parameters for kind in classes)
+
+
+@pytest.mark.parametrize("page", pages_with(INCLUDE), ids=lambda path: path.stem)
+def test_what_a_page_includes_of_another_is_there(page):
+    for path, options in INCLUDE.findall(page.read_text()):
+        lines = (page.parent / path).read_text().splitlines()
+        for text in re.findall(r':(?:start-after|end-before): "(.*)"', options):
+            assert text in lines, (path, text)
+
+
+def test_every_module_has_its_place_in_the_reference():
+    pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
+    documented = set(re.findall(r"automodule:: (\S+)", pages))
+    for name in modules():
+        package = importlib.import_module(name.rpartition(".")[0])
+        exports = (getattr(package, export) for export in getattr(package, "__all__", ()))
+        exported = {getattr(export, "__module__", None) for export in exports}
+        assert name in documented | exported, f"{name}: add it to a page of docs/api"
+
+
+def modules():
+    """Names of all modules that are not packages themselves."""
+    for package, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            if not path.name.startswith("_"):
+                yield ".".join([package, *path.relative_to(folder).with_suffix("").parts])
