@@ -116,6 +116,9 @@ def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched
     shutil.copytree(run, copy)
     newest = max((copy / "checkpoints").iterdir())
     newest.write_bytes(damage(newest.read_bytes()))
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.training.total_frames *= 2  # there is something left to do
+    OmegaConf.save(cfg, copy / "config.yaml")
     before = contents(copy)
     outcome = command("train", f"resume={copy}", cwd=tmp_path)
     assert outcome.returncode != 0
