@@ -26,16 +26,30 @@ from torchrl_mcp.analysis.films import save_film
 from torchrl_mcp.builtin import FOLDER
 
 RESULTS = Path(__file__).resolve().parent / "results"
-LOST, CHANGING = {"failure_weighting": 0.5}, {"switch_interval": 1.5}
+ANY, LOST, CHANGING = {"switch_candidates": 1}, {"failure_weighting": 0.5}, {"switch_interval": 1.5}
+SIMILAR = {"switch_candidates": 16, "switch_interval": 3.0}
 PHASES: dict[str, list[tuple[int, dict[str, float]]]] = {
-    "biped": [(4_505_600, {}), (6_348_800, LOST), (7_987_200, CHANGING)],
-    "humanoid": [(3_686_400, {}), (5_120_000, LOST), (6_553_600, CHANGING)],
-    "trex": [(4_096_000, {})],
+    "biped": [
+        (4_505_600, ANY),
+        (6_348_800, LOST),
+        (7_987_200, CHANGING),
+        (11_264_000, SIMILAR),
+        (13_312_000, CHANGING),
+    ],
+    "humanoid": [
+        (3_686_400, ANY),
+        (5_120_000, LOST),
+        (6_553_600, CHANGING),
+        (9_216_000, SIMILAR),
+        (10_649_600, CHANGING),
+    ],
+    "trex": [(4_096_000, ANY)],
 }
 COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
 EVALUATION_SEED = 12345
-EVALUATION = {"clip_end": "switch", "switch_interval": 5.0}
+CHANGES = {"to one of 16 moments": 16, "to any moment": 1}
+"""How many random moments of clips the most similar is taken of, when the reference changes."""
 
 
 def main() -> None:
@@ -46,7 +60,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="runs at a time, one core each")
     parser.add_argument("--report", action="store_true", help="train nothing: report the runs as far as they are")
     parser.add_argument("--publish", action="store_true", help="write the networks that come with the library, too")
-    parser.add_argument("--episodes", type=int, default=128, help="with changing references, of each evaluation")
+    parser.add_argument("--episodes", type=int, default=256, help="with changing references, of each evaluation")
     parser.add_argument("--episodes-per-clip", type=int, default=16)
     arguments = parser.parse_args()
     runs = {character: arguments.output / f"imitation-{character}" for character in arguments.characters}
@@ -66,8 +80,9 @@ def train(run: Path, character: str) -> None:
             set_phase(run, steps, settings)
             arguments = [f"resume={run}"]
         else:
-            phase = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
-            arguments = [*COMMON, *MACHINE, *phase]
+            phase = [f"imitation.{name}={value}" for name, value in settings.items()]
+            facts = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
+            arguments = [*COMMON, *MACHINE, *facts, *phase]
         command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
@@ -86,15 +101,11 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     facts = {character: cost(run) for character, run in runs.items()}
     rows, clips = [], []
     for character, run in runs.items():
-        # Every episode shall last 10 s, so that completing one means the same everywhere.
-        evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **EVALUATION)
-        for mode, numbers in evaluation.items():
-            measures = numbers.pop("measures")
-            del numbers["diagnostics"]
-            completed = 1 - numbers.pop("terminated")
-            row = {"character": character, "mode": mode, "completed": completed, **facts[character], **numbers}
-            rows.append(row | {"tracking_error": measures["tracking_error"], "machine": platform.machine()})
-            print(f"{character} {mode}: completed {completed:.0%}, {measures['tracking_error']:.3f} m", flush=True)
+        for changes, candidates in CHANGES.items():
+            for mode, numbers in evaluate(run, episodes, candidates).items():
+                about = {"character": character, "changes": changes, "mode": mode}
+                rows.append(about | facts[character] | numbers | {"machine": platform.machine()})
+                print(*about.values(), f"{numbers['completed']:.0%}, {numbers['tracking_error']:.3f} m", flush=True)
         followed = experiment.evaluate_clips(run, episodes=episodes_per_clip, seed=EVALUATION_SEED)
         clips += [{"character": character, **asdict(clip)} for clip in followed]
     write_table(rows, RESULTS / "imitation.csv")
@@ -105,6 +116,18 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     for character, run in runs.items():
         _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
         save_film(agent.actor.policy, env, RESULTS / f"imitation_{character}.gif")
+
+
+def evaluate(run: Path, episodes: int, candidates: int) -> dict[str, dict[str, float]]:
+    """Return the numbers of a run, deterministic and stochastic, while references change."""
+    # Every episode shall last 10 s, so that completing one means the same everywhere.
+    changing = {"clip_end": "switch", "switch_interval": 5.0, "switch_candidates": candidates}
+    evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **changing)
+    for numbers in evaluation.values():
+        numbers["completed"] = 1 - numbers.pop("terminated")
+        numbers["tracking_error"] = numbers.pop("measures")["tracking_error"]
+        del numbers["diagnostics"]
+    return evaluation
 
 
 def cost(run: Path) -> dict[str, float]:
