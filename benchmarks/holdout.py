@@ -3,8 +3,8 @@
     python benchmarks/holdout.py --output runs/holdout    # hours; goes on where it was interrupted
 
 MCP is pre-trained on directions in [0, 3/2 pi] and transferred to [3/2 pi, 2 pi], exploring over actions and over
-weights; so is the additive mixer; scratch learns the held-out directions alone, for as many steps as pre-training and
-transfer take together. Every run is one of ``torchrl-mcp-train``, on one core.
+weights; so are the additive mixer and the baselines; scratch learns the held-out directions alone, for as many steps as
+pre-training and transfer take together. Every run is one of ``torchrl-mcp-train``, on one core.
 """
 
 import argparse
@@ -33,27 +33,41 @@ COMMON = ["task=holdout", "preset=fast", "logger=none", "torch_threads=1", "num_
 
 @dataclass(frozen=True)
 class Contender:
-    """A line of the table."""
+    """A line of the table.
+
+    Attributes:
+        label: What it is called there.
+        pretraining: One of ``PRETRAININGS``, or None.
+        settings: Of its transfer, beside those of its pre-training.
+        steps: Of its transfer.
+        paper: The paper's figure.
+    """
 
     label: str
-    settings: tuple[str, ...]
-    mixer: str | None  # of its pre-training
-    steps: int
-    paper: str
+    pretraining: str | None
+    settings: tuple[str, ...] = ()
+    steps: int = TRANSFER
+    paper: str = ""
 
+
+PRETRAININGS = {
+    "multiplicative": ["mixer=multiplicative"],
+    "additive": ["mixer=additive"],
+    **{method: [f"method={method}"] for method in ("latent_space", "finetune", "moe", "option_critic")},
+}
 
 CONTENDERS = {
     "transfer-multiplicative-action": Contender(
-        "MCP, over actions", ("exploration=action",), "multiplicative", TRANSFER, "0.812 +- 0.030"
+        "MCP, over actions", "multiplicative", ("exploration=action",), paper="0.812 +- 0.030"
     ),
-    "transfer-multiplicative-weights": Contender(
-        "MCP, over weights", ("exploration=weights",), "multiplicative", TRANSFER, ""
-    ),
-    "transfer-additive-action": Contender(
-        "additive mixer", ("mixer=additive",), "additive", TRANSFER, ""
-    ),
-    "scratch": Contender("scratch", ("method=scratch",), None, PRETRAINING + TRANSFER, "0.951 +- 0.093"),
-}  # fmt: skip
+    "transfer-multiplicative-weights": Contender("MCP, over weights", "multiplicative", ("exploration=weights",)),
+    "transfer-additive-action": Contender("additive mixer", "additive"),
+    "transfer-latent_space": Contender("latent space", "latent_space", paper="0.745 +- 0.060"),
+    "transfer-finetune": Contender("finetune", "finetune", paper="0.885 +- 0.062"),
+    "transfer-moe": Contender("mixture of experts", "moe"),
+    "transfer-option_critic": Contender("option-critic", "option_critic"),
+    "scratch": Contender("scratch", None, ("method=scratch",), PRETRAINING + TRANSFER, "0.951 +- 0.093"),
+}
 
 DIRECTIONS = {"pretrain": (0.0, 1.5 * math.pi), "transfer": (1.5 * math.pi, 2.0 * math.pi)}
 SPACING = math.radians(7.5)
@@ -78,25 +92,26 @@ def main() -> None:
         report(arguments.output, arguments.seeds, arguments.episodes)
         return
     chains = [(name, seed) for seed in arguments.seeds for name in CONTENDERS]
-    pretrainings = [(mixer, seed) for seed in arguments.seeds for mixer in ("multiplicative", "additive")]
+    pretrainings = [(name, seed) for seed in arguments.seeds for name in PRETRAININGS]
     with ThreadPoolExecutor(arguments.jobs) as pool:
         list(pool.map(lambda job: pretrain(arguments.output, *job), pretrainings))
         list(pool.map(lambda job: learn(arguments.output, *job), chains))
     report(arguments.output, arguments.seeds, arguments.episodes)
 
 
-def pretrain(folder: Path, mixer: str, seed: int) -> None:
-    """Pre-train a mixer, or finish it."""
-    settings = ["stage=pretrain", f"mixer={mixer}", f"training.total_frames={PRETRAINING}"]
-    train(folder / f"pretrain-{mixer}-{seed}", [*settings, f"seed={seed}"])
+def pretrain(folder: Path, name: str, seed: int) -> None:
+    """Pre-train a method or mixer, or finish it."""
+    settings = ["stage=pretrain", *PRETRAININGS[name], f"training.total_frames={PRETRAINING}"]
+    train(folder / f"pretrain-{name}-{seed}", [*settings, f"seed={seed}"])
 
 
 def learn(folder: Path, name: str, seed: int) -> None:
     """Train a contender on the held-out directions, or finish it."""
     contender = CONTENDERS[name]
     settings = ["stage=transfer", *contender.settings, f"training.total_frames={contender.steps}"]
-    if contender.mixer:
-        settings.append(f"pretrained={folder / f'pretrain-{contender.mixer}-{seed}'}")
+    if contender.pretraining:
+        pretrained = folder / f"pretrain-{contender.pretraining}-{seed}"
+        settings += [*PRETRAININGS[contender.pretraining], f"pretrained={pretrained}"]
     train(folder / f"{name}-{seed}", [*settings, f"seed={seed}"])
 
 

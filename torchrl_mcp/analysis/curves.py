@@ -4,7 +4,7 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +118,12 @@ def plot_curves(
         xlabel: What the steps are.
         ylabel: What the quantity is.
     """
-    styles = styles or ({"color": colour, "linewidth": 2} for colour in cycle(COLOURS))
+    # Where colours repeat, dashes tell lines apart.
+    lines = product(("-", "--", ":"), COLOURS)
+    styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
         axes.fill_between(curve.frames, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0)
-        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", **style)
+        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", dash_capstyle="round", **style)
     axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
     lowest = min(curve.low.min(initial=0.0) for curve in curves)
     bottom, top = axes.get_ylim()
