@@ -123,7 +123,7 @@ def plot_curves(
     styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
         axes.fill_between(curve.frames, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0)
-        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", dash_capstyle="round", **style)
+        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", **style)
     axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
     lowest = min(curve.low.min(initial=0.0) for curve in curves)
     bottom, top = axes.get_ylim()
