@@ -1,4 +1,7 @@
+import mujoco
 import pytest
+
+from torchrl_mcp.envs.motions.joints import character_model
 
 
 @pytest.fixture(scope="session")
@@ -29,3 +32,19 @@ def human_bands() -> dict[str, tuple[float, float]]:
         "elbow_mean": (15, 34),
         "elbow_swing": (18, 50),
     }
+
+
+@pytest.fixture(scope="session")
+def kinematics():
+    """Body positions and orientations of a frame of a clip by name, from MuJoCo."""
+
+    def kinematics(clip, index=0):
+        model = character_model(clip.character)
+        data = mujoco.MjData(model)
+        data.qpos = clip.qpos[index].numpy()
+        mujoco.mj_kinematics(model, data)
+        names = [model.body(i).name for i in range(model.nbody)]
+        orientations = data.xmat.reshape(-1, 3, 3)
+        return dict(zip(names, data.xpos.copy(), strict=True)), dict(zip(names, orientations, strict=True))
+
+    return kinematics

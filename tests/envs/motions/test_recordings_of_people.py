@@ -26,16 +26,6 @@ SPEED_BANDS = {"stride_time": (1.02, 1.28), "bob": (0.018, 0.045), "slide": (0.0
 """What depends on speed at 1 m/s, and a recording's slide."""
 
 
-def kinematics(clip, index=0):
-    """Body positions and orientations by name, from MuJoCo."""
-    model = character_model(clip.character)
-    data = mujoco.MjData(model)
-    data.qpos = clip.qpos[index].numpy()
-    mujoco.mj_kinematics(model, data)
-    names = [model.body(i).name for i in range(model.nbody)]
-    return dict(zip(names, data.xpos.copy(), strict=True)), dict(zip(names, data.xmat.reshape(-1, 3, 3), strict=True))
-
-
 @pytest.fixture(scope="module")
 def sfu(mocap):
     return mocap / "sfu" / "0005_Walking001.bvh"
@@ -52,7 +42,7 @@ CMU_NAMES = {"hip": "femur", "knee": "tibia", "ankle": "foot"}
 
 @pytest.mark.parametrize("character", ["humanoid", "biped"])
 @pytest.mark.parametrize("file", ["sfu/0005_Walking001.bvh", "cmu/02_01.amc", "cmu/02_02.amc"])
-def test_knees_and_ankles_of_real_files_are_where_the_scaled_source_has_them(mocap, file, character):
+def test_knees_and_ankles_of_real_files_are_where_the_scaled_source_has_them(mocap, file, character, kinematics):
     """Within the difference of the hips' width, 13 mm, but for knees that are straighter than straight."""
     cmu, path = file.startswith("cmu"), mocap / file
     source = read_asf_amc(path) if cmu else read_bvh(path)

@@ -2,7 +2,6 @@ import math
 import re
 from contextlib import suppress
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -113,16 +112,6 @@ def load(tmp_path):
     return load
 
 
-def kinematics(clip, index=0):
-    """Body positions and orientations by name, from MuJoCo."""
-    model = character_model(clip.character)
-    data = mujoco.MjData(model)
-    data.qpos = clip.qpos[index].numpy()
-    mujoco.mj_kinematics(model, data)
-    names = [model.body(i).name for i in range(model.nbody)]
-    return dict(zip(names, data.xpos.copy(), strict=True)), dict(zip(names, data.xmat.reshape(-1, 3, 3), strict=True))
-
-
 def hinge(clip, name):
     return clip.qpos[:, character_model(clip.character).joint(name).qposadr[0]]
 
@@ -146,7 +135,7 @@ def test_standing_with_the_arms_down_is_the_rest_pose_of_the_character(load):
     np.testing.assert_allclose(clip.qpos[0], expected, atol=1e-7)
 
 
-def test_a_t_pose_holds_the_arms_to_their_own_sides(load):
+def test_a_t_pose_holds_the_arms_to_their_own_sides(load, kinematics):
     places, _ = kinematics(load([{}] * 2))
     assert direction(places, "left_shoulder", "left_wrist") == pytest.approx([0, 1, 0], abs=1e-7)
     assert direction(places, "right_shoulder", "right_wrist") == pytest.approx([0, -1, 0], abs=1e-7)
@@ -183,7 +172,7 @@ ANY = {
 }
 
 
-def test_every_bone_of_the_limbs_points_where_the_source_has_it(load):
+def test_every_bone_of_the_limbs_points_where_the_source_has_it(load, kinematics):
     places, _ = kinematics(load([ANY] * 2))
     source = source_positions(ANY)
     for side in ("left", "right"):
@@ -194,7 +183,7 @@ def test_every_bone_of_the_limbs_points_where_the_source_has_it(load):
 
 
 @pytest.mark.parametrize("body", ["root", "chest", "neck"])
-def test_the_trunk_and_the_head_are_turned_as_in_the_source(load, body):
+def test_the_trunk_and_the_head_are_turned_as_in_the_source(load, body, kinematics):
     chain = {"root": ["Hips"], "chest": ["Hips", "Spine", "Chest"], "neck": ["Hips", "Spine", "Chest", "Head"]}[body]
     turn = Rotation.identity()
     for name in chain:
@@ -203,7 +192,7 @@ def test_the_trunk_and_the_head_are_turned_as_in_the_source(load, body):
     np.testing.assert_allclose(orientations[body], FORWARD @ turn.as_matrix() @ FORWARD.T, atol=1e-7)
 
 
-def test_the_twist_of_a_limb_is_steady_while_it_is_too_straight_to_show(load):
+def test_the_twist_of_a_limb_is_steady_while_it_is_too_straight_to_show(load, kinematics):
     """The plane of the leg stays turned out by 25 degrees while the knee straightens and bends again."""
     out = Rotation.from_euler("Y", 25, degrees=True)
     poses = [{"LeftLeg": out * about(X, flexion) * out.inv()} for flexion in (60, 30, 10, 5, 1, 12, 40, 60)]
@@ -218,14 +207,14 @@ def test_a_knee_bent_the_wrong_way_is_straight(load):
     assert hinge(load([arms_down(LeftLeg=about(X, -4))] * 2), "left_knee").tolist() == [0, 0]
 
 
-def test_a_foot_that_the_rest_pose_does_not_hold_level_is_set_flat(load):
+def test_a_foot_that_the_rest_pose_does_not_hold_level_is_set_flat(load, kinematics):
     """The file says that the toes point down by 30 degrees and the soles are rolled, all the time, and it stands."""
     _, orientations = kinematics(load([{"LeftFoot": about(X, 30) * about(Z, 10)}] * 3))
     np.testing.assert_allclose(orientations["left_ankle"][:, 2], [0, 0, 1], atol=1e-7)
     np.testing.assert_allclose(orientations["right_ankle"][:, 2], [0, 0, 1], atol=1e-7)
 
 
-def test_a_foot_that_turns_in_the_air_is_not_held_flat(load):
+def test_a_foot_that_turns_in_the_air_is_not_held_flat(load, kinematics):
     """The foot stands for three quarters of the time; then it is lifted with its toes up."""
     lifted = {"LeftUpLeg": about(X, -30), "LeftLeg": about(X, 60), "LeftFoot": about(X, -50)}
     clip = load([{}] * 12 + [lifted] * 4, fps=15.0, options={"rate": 15.0})
@@ -260,7 +249,7 @@ def test_the_slope_of_a_laboratory_is_taken_out_and_that_of_stairs_is_not(load, 
     assert abs(risen) >= 0.99 * (left_over == 1.0) * abs(4 * rise) * CHARACTER_LEG / LEG
 
 
-def test_the_biped_moves_its_legs_and_torso_as_the_humanoid_does(load):
+def test_the_biped_moves_its_legs_and_torso_as_the_humanoid_does(load, kinematics):
     humanoid, biped = load([ANY] * 2), load([ANY] * 2, "biped")
     (places, turned), (own_places, own_turned) = kinematics(humanoid), kinematics(biped)
     np.testing.assert_allclose(own_turned["torso"], turned["chest"], atol=1e-9)
@@ -391,7 +380,7 @@ def test_other_names_are_given_by_a_map(load):
     assert torch.equal(found.qpos, load([ANY] * 2).qpos)
 
 
-def test_a_map_wins_over_what_names_suggest(load):
+def test_a_map_wins_over_what_names_suggest(load, kinematics):
     clip = load([ANY] * 2, options={"joint_map": {"chest": "Spine"}})
     _, orientations = kinematics(clip)
     turn = (ANY["Hips"] * ANY["Spine"]).as_matrix()
