@@ -6,6 +6,8 @@ from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
 
+METRICS = "metrics.csv"
+
 
 class Record:
     """Writes one row of metrics per iteration to ``metrics.csv`` and to loggers.
@@ -16,7 +18,7 @@ class Record:
     """
 
     def __init__(self, folder: Path, loggers: Iterable[Logger] = ()) -> None:
-        self.path = folder / "metrics.csv"
+        self.path = folder / METRICS
         self.loggers = list(loggers)
         self._columns: list[str] = []
 

@@ -24,10 +24,10 @@ from rich.live import Live
 from rich.table import Table
 
 from torchrl_mcp.experiment import CONFIG, EVALUATION
+from torchrl_mcp.record import METRICS
 
 LOG = "train.log"
 MANIFEST = "benchmark-{}.json"
-METRICS = "metrics.csv"
 STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
 INTERVAL = 1.0
 """Seconds between looks at the folders."""

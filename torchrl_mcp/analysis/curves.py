@@ -15,6 +15,7 @@ from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
+from torchrl_mcp.record import METRICS
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ class Curve:
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
     """Return the rows of a run's ``metrics.csv``; blank is NaN, and a row half written is left out."""
-    path = run / "metrics.csv"
+    path = run / METRICS
     if not path.exists():
         return []
     with path.open(newline="") as file:

@@ -14,11 +14,12 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
+from torchrl_mcp.record import METRICS
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
 
-CONFIG, METRICS, EVALUATION, ORIGIN = "config.yaml", "metrics.csv", "evaluation.json", "origin.json"
+CONFIG, EVALUATION, ORIGIN = "config.yaml", "evaluation.json", "origin.json"
 
 REQUIRED = {
     "task.name": str,
