@@ -180,7 +180,10 @@ def test_a_run_of_before_there_were_evaluations_is_evaluated_as_a_new_one(evalua
     cfg = OmegaConf.load(evaluated / "config.yaml")
     del cfg["evaluation"]
     OmegaConf.save(cfg, tmp_path / "config.yaml")
-    assert experiment.configuration(tmp_path).evaluation == {"episodes": 128, "seed": 12345, "environment": {}}
+    usual = {"episodes": 128, "seed": 12345, "environment": {}}
+    assert experiment.configuration(tmp_path).evaluation == usual
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):  # as on the command line
+        assert experiment.configuration(tmp_path).evaluation == usual
 
 
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():

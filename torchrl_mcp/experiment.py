@@ -3,12 +3,14 @@
 import json
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
@@ -312,7 +314,8 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
 
 def _usual_evaluation(task: str) -> DictConfig:
     """Return how a new run of a task is evaluated."""
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+    begun = GlobalHydra.instance().is_initialized()  # on the command line
+    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return compose("train", [f"task={task}"]).evaluation
 
 

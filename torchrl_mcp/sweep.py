@@ -100,7 +100,7 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
         ValueError: If there are none, or two of different settings would share a folder.
     """
     params = [f"{key}={value}" for key, value in master.benchmark.get("params", {}).items()]
-    given = [argument for argument in master.hydra.overrides.task if not argument.startswith("benchmark=")]
+    given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
     overrides = OverridesParser.create(config_loader=loader).parse_overrides([*params, *given])
     choices = {override.get_key_element(): values(override) for override in overrides}
     rows: Any = OmegaConf.to_container(master.benchmark.rows)
@@ -109,7 +109,7 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     for settings in expand(rows, choices):
         job = make_job({**settings, "stage": "transfer"}, master, loader)
         if job.config["transfer"]["keep"] and not job.config["pretrained"]:
-            needed = pretraining_of(settings, job.config["task"])
+            needed = pretraining_of(settings, job.config["task"], master.benchmark.get("pretrain_seed"))
             key = tuple(f"{name}={value}" for name, value in needed.items())
             pretraining[key] = pretraining.get(key) or make_job(needed, master, loader)
             job = job.after(pretraining[key].folder)
@@ -141,15 +141,21 @@ def values(override: Override) -> list[str]:
     return [override.get_value_element_as_str()]
 
 
-def pretraining_of(settings: Settings, task: Mapping[str, Any]) -> Settings:
-    """Return the settings of the pre-training from which a run with ``settings`` on ``task`` transfers."""
+def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None = None) -> Settings:
+    """Return the settings of the pre-training, with a ``seed`` of its own if given, from which a run transfers.
+
+    Args:
+        settings: Those of the run.
+        task: The configuration of its task.
+        seed: That of the pre-training, if not the run's.
+    """
     name = task["name"] if "pretrain" in task else "imitation"
     kept = {
         key: value
         for key, value in settings.items()
         if key not in TRANSFER_ONLY and (name == task["name"] or not key.startswith("task."))
     }
-    return {**kept, "task": name, "stage": "pretrain"}
+    return {**kept, "task": name, "stage": "pretrain"} | ({} if seed is None else {"seed": str(seed)})
 
 
 def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Job:
