@@ -24,6 +24,7 @@ from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metri
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.films import save_film
 from torchrl_mcp.builtin import FOLDER
+from torchrl_mcp.run_folder import CONFIG
 
 RESULTS = Path(__file__).resolve().parent / "results"
 ANY, LOST, CHANGING = {"switch_candidates": 1}, {"failure_weighting": 0.5}, {"switch_interval": 1.5}
@@ -76,7 +77,7 @@ def main() -> None:
 def train(run: Path, character: str) -> None:
     """Train a character in a process of its own, or go on where a former one stopped."""
     for steps, settings in PHASES[character]:
-        if (run / experiment.CONFIG).exists():
+        if (run / CONFIG).exists():
             set_phase(run, steps, settings)
             arguments = [f"resume={run}"]
         else:
@@ -89,11 +90,11 @@ def train(run: Path, character: str) -> None:
 
 def set_phase(run: Path, steps: int, settings: Mapping[str, float]) -> None:
     """Let the run in a folder go on until so many steps, with other settings of its task."""
-    cfg = OmegaConf.load(run / experiment.CONFIG)
+    cfg = OmegaConf.load(run / CONFIG)
     cfg.training.total_frames = steps
     cfg.imitation.update(settings)
     cfg.task.pretrain.update(settings)
-    OmegaConf.save(cfg, run / experiment.CONFIG)
+    OmegaConf.save(cfg, run / CONFIG)
 
 
 def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None:

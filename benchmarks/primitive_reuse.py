@@ -26,7 +26,8 @@ from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from training_throughput import about, configuration, table, write
 
-from torchrl_mcp import experiment
+from torchrl_mcp import assembly
+from torchrl_mcp.collection import LocalCollection
 from torchrl_mcp.training import Trainer
 
 RESULTS = Path(__file__).resolve().parent / "results" / "primitive_reuse.csv"
@@ -54,10 +55,10 @@ def make_trainer(cfg: DictConfig, sizes: Sizes, folder: Path, *, reuse: bool) ->
         action_spec=torch.empty(num_envs, sizes.action),
     )
     torch.manual_seed(cfg.seed)
-    agent = experiment.make_agent(cfg, env)
+    agent = assembly.make_agent(cfg, env)
     if not reuse:
         agent = replace(agent, actor=instantiate(cfg.actor)(agent.parts))
-    return experiment.make_trainer(cfg, agent, env, folder)
+    return assembly.make_trainer(cfg, agent, LocalCollection(env), folder)
 
 
 @torch.no_grad()

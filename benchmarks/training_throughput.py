@@ -76,7 +76,7 @@ class Turns:
 
 def ours(method: str, precision: str, training: dict[str, int]) -> None:
     """Train by the library's own configuration and loop."""
-    from torchrl_mcp import experiment
+    from torchrl_mcp import assembly
 
     settings = {
         "method": method,
@@ -95,8 +95,8 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         **{f"training.{key}": value for key, value in training.items()},
     }
     cfg = configuration(*(f"{key}={value}" for key, value in settings.items()))
-    env = experiment.make_env(cfg, num_envs=cfg.training.num_envs, seed=cfg.seed)
-    trainer = experiment.make_trainer(cfg, experiment.make_agent(cfg, env), env, Path(cfg.run_dir))
+    collection = assembly.make_collection(cfg)
+    trainer = assembly.make_trainer(cfg, assembly.make_agent(cfg, collection.env), collection, Path(cfg.run_dir))
     turns = Turns()
     trainer.record.loggers = [turns]
     turns.begin()

@@ -4,7 +4,7 @@ from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp import builtin, checkpoint, experiment
+from torchrl_mcp import assembly, builtin, checkpoint, experiment
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]
@@ -66,9 +66,9 @@ def test_pre_training_goes_on_from_another_with_other_motions(run, published, tm
     settings = [*BIPED, "motions=turning", "training.total_frames=128"]
     for origin, missing in ((checkpoint.find(run), set()), (published, {"critic"})):
         cfg = configure(tmp_path / "run", *settings, f"pretrained={origin}")
-        env = experiment.make_env(cfg, num_envs=1, seed=0)
+        env = assembly.make_env(cfg, num_envs=1, seed=0)
         assert len(env.library) == 7
-        agent, other = experiment.make_agent(cfg, env, origin), experiment.restore(origin, num_envs=1, seed=0)[1]
+        agent, other = assembly.make_agent(cfg, env, origin), experiment.restore(origin, num_envs=1, seed=0)[1]
         for name in set(agent.parts) - missing:
             assert parameters(agent.parts[name]) == parameters(other.parts[name])
     folder = experiment.train(cfg)

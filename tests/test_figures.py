@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
-from torchrl_mcp import experiment, figures
+from torchrl_mcp import assembly, figures
 from torchrl_mcp.builtin import publish
 from torchrl_mcp.clips import single_motion
 
@@ -31,7 +31,7 @@ def save(folder, *overrides):
     ]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         cfg = compose("train", overrides=settings)
-    agent = experiment.make_agent(cfg, experiment.make_env(cfg, num_envs=1, seed=0))
+    agent = assembly.make_agent(cfg, assembly.make_env(cfg, num_envs=1, seed=0))
     config = OmegaConf.to_container(cfg, resolve=True)
     publish(agent.parts, config, folder / "checkpoints" / "checkpoint-000000000128.torchrl")
     with (folder / "metrics.csv").open("w", newline="") as file:

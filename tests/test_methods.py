@@ -6,7 +6,7 @@ import shutil
 import pytest
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp import checkpoint, experiment
+from torchrl_mcp import assembly, checkpoint, experiment
 from torchrl_mcp.transfer import fingerprint
 
 ANT = (["task=holdout"], ["task=holdout"])
@@ -67,7 +67,7 @@ def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_fre
     cfg, agent, env = experiment.restore(transferred, num_envs=1, seed=0)
     after = {name: fingerprint(part) for name, part in agent.parts.items()}
     file = checkpoint.find(pretrained) if pretrained else None
-    start = {name: fingerprint(part) for name, part in experiment.make_agent(cfg, env, file).parts.items()}
+    start = {name: fingerprint(part) for name, part in assembly.make_agent(cfg, env, file).parts.items()}
     if pretrained:
         before = fingerprints(pretrained)
         assert {name for name in start if start[name] == before.get(name)} == set(cfg.transfer.keep)

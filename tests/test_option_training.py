@@ -6,7 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp import experiment
+from torchrl_mcp import assembly, experiment
 from torchrl_mcp.training import Trainer
 
 TIMES = ("seconds", "time/")
@@ -101,14 +101,14 @@ def test_transfer_of_options_trains_their_values_alone(tmp_path, pretrained):
 def test_all_primitives_learn_in_one_run(pretrained):
     cfg, agent, _ = experiment.restore(pretrained["hierarchical"], num_envs=1, seed=0)
     torch.manual_seed(cfg.seed)
-    fresh = experiment.make_agent(cfg, experiment.make_env(cfg, num_envs=4, seed=0))
+    fresh = assembly.make_agent(cfg, assembly.make_env(cfg, num_envs=4, seed=0))
     for k in range(7):
         trained, untrained = (a.parts["primitives"].policies[k].state_dict() for a in (agent, fresh))
         assert not torch.equal(trained["output.weight"], untrained["output.weight"]), k
 
 
 def test_environments_follow_one_clip_of_seven_each_to_the_end_of_an_episode():
-    env = experiment.make_env(configure("nowhere", "hierarchical", *BIPED), num_envs=64, seed=0)
+    env = assembly.make_env(configure("nowhere", "hierarchical", *BIPED), num_envs=64, seed=0)
     rollout = env.rollout(40, break_when_any_done=False)
     assert set(rollout["option"].unique().tolist()) == set(range(7))
     begins = rollout["done"].new_zeros(64, 40)

@@ -241,7 +241,7 @@ def test_a_folder_of_other_settings_is_not_taken_for_done(copy):
 
 def needs_plugin(name):
     missing = find_spec("hydra_plugins") is None or find_spec(f"hydra_plugins.hydra_{name}_launcher") is None
-    return pytest.mark.skipif(missing, reason=f"needs hydra-{name}-launcher: pip install 'torchrl-mcp[launchers,ray]'")
+    return pytest.mark.skipif(missing, reason=f"needs hydra-{name}-launcher: an optional dependency")
 
 
 @pytest.mark.slow

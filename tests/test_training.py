@@ -11,7 +11,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp import checkpoint, experiment
+from torchrl_mcp import assembly, checkpoint, experiment
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.training import Trainer
 
@@ -91,9 +91,9 @@ def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path
 
 def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, pretrained):
     settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]"]
-    start = experiment.make_agent(
+    start = assembly.make_agent(
         cfg := configure(tmp_path / "run", *settings),
-        experiment.make_env(cfg, num_envs=1, seed=0),
+        assembly.make_env(cfg, num_envs=1, seed=0),
         checkpoint.find(pretrained),
     )
     before = final_parts(pretrained)
@@ -129,13 +129,13 @@ def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_go
 
 def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypatch):
     cfg = configure(tmp_path / "run", "stage=transfer", f"pretrained={pretrained}")
-    real = experiment.Trainer._update_normalisers
+    real = Trainer._update_normalisers
 
     def meddle(trainer, batch):
         real(trainer, batch)
         trainer.parts["primitives"].output.bias.data[0, 0] += 1e-6
 
-    monkeypatch.setattr(experiment.Trainer, "_update_normalisers", meddle)
+    monkeypatch.setattr(Trainer, "_update_normalisers", meddle)
     with pytest.raises(RuntimeError, match="primitives"):
         experiment.train(cfg)
 

@@ -25,6 +25,7 @@ from tqdm import tqdm
 from torchrl_mcp import __version__, analysis, experiment
 from torchrl_mcp.checkpoint import FOLDER
 from torchrl_mcp.parallel import start, ticks
+from torchrl_mcp.run_folder import CONFIG
 
 Runs = Mapping[str, DictConfig]
 
@@ -108,7 +109,7 @@ def configuration(folder: Path, overrides: Sequence[str]) -> DictConfig:
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         cfg = compose("train", list(overrides))
     cfg.run_dir = str(folder)
-    saved = folder / experiment.CONFIG
+    saved = folder / CONFIG
     if saved.exists() and _settings(OmegaConf.load(saved)) != _settings(cfg):
         raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
     return cfg
@@ -157,7 +158,7 @@ def learn_from_scratch(folder: Path, runs: Runs) -> None:
 def train(cfg: DictConfig) -> None:
     """Train as configured, or go on where training stopped."""
     folder = Path(cfg.run_dir)
-    if (folder / experiment.CONFIG).exists():
+    if (folder / CONFIG).exists():
         experiment.resume(folder)
     else:
         experiment.train(cfg)

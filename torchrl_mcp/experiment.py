@@ -1,10 +1,8 @@
-"""From a configuration to objects. Beside the entry points, the only module that knows Hydra."""
+"""The life of a run: trained in a folder of its own, resumed, restored, evaluated and published."""
 
 import json
 import math
-from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,112 +11,23 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.envs import Compose
 from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp import checkpoint, origin
-from torchrl_mcp.actors import Actor
+from torchrl_mcp import checkpoint
 from torchrl_mcp.analysis.imitation import ClipResult, follow_each
+from torchrl_mcp.assembly import Agent, make_agent, make_collection, make_env, make_trainer
 from torchrl_mcp.builtin import builtin, publish
 from torchrl_mcp.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation import evaluate, summary
 from torchrl_mcp.memory import TransformedCharacterEnv
-from torchrl_mcp.record import Record
+from torchrl_mcp.origin import origin
+from torchrl_mcp.run_folder import CONFIG, EVALUATION, ORIGIN
 from torchrl_mcp.training import Trainer
-from torchrl_mcp.transfer import FrozenParts, require_parts
 
-CONFIG = "config.yaml"
-EVALUATION = "evaluation.json"
-
-
-@dataclass(frozen=True)
-class Agent:
-    """A method's networks for the sizes of an environment."""
-
-    parts: nn.ModuleDict
-    actor: Actor
-    critic: TensorDictModuleBase
-    frozen: FrozenParts
-
-
-def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
-    """Return the environments of the configured task and stage, with the transforms that the method needs, if any.
-
-    Raises:
-        ValueError: If the task has no such stage.
-    """
-    if cfg.stage.name not in cfg.task:
-        raise ValueError(
-            f"task={cfg.task.name} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
-            f"task={cfg.task.name} with stage=transfer and pretrained=<folder of the pre-training>"
-        )
-    env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, num_threads=cfg.num_threads, **kwargs)
-    if not (transforms := instantiate(cfg.get("transforms", []))):
-        return env
-    return TransformedCharacterEnv(env, Compose(*transforms))
-
-
-def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
-    """Return the agent of the configured method.
-
-    If the checkpoint file ``pretrained`` is given, the parts that transfer keeps come from it, or in pre-training all
-    that it holds.
-    """
-    sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
-    parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
-    names: Sequence[str] = ()
-    if cfg.stage.name == "transfer":
-        require_parts(parts, cfg.transfer.keep, "transfer.keep")
-        if pretrained is not None and cfg.transfer.keep:
-            checkpoint.load_parts(parts, cfg.transfer.keep, pretrained)
-        names = cfg.transfer.freeze
-    frozen = FrozenParts(parts, names)
-    actor = instantiate(cfg.actor)(parts, frozen=names)
-    critic = instantiate(cfg.critic)(parts, sizes["observation"], sizes["goal"])
-    if cfg.stage.name == "pretrain" and pretrained is not None:
-        checkpoint.load_agent(parts, pretrained)
-    parts.to(cfg.device)
-    return Agent(parts, actor, critic, frozen)
-
-
-def make_trainer(cfg: DictConfig, agent: Agent, env: CharacterEnv | TransformedCharacterEnv, folder: Path) -> Trainer:
-    """Return the trainer of an agent.
-
-    A method whose samples last for several steps, such as choices, names a ``batch_factor`` by which its batches are
-    larger than ``training.frames_per_batch``.
-    """
-    trainable = {
-        "actor": [p for p in agent.actor.trained.parameters() if p.requires_grad],
-        "critic": list(agent.parts["critic"].parameters()),
-    }
-    optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
-    loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
-    loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
-    training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
-    training["frames_per_batch"] *= cfg.get("batch_factor", 1)
-    return Trainer(
-        env=env,
-        parts=agent.parts,
-        actor=agent.actor,
-        critic=agent.critic,
-        loss=loss,
-        advantages=instantiate(cfg.objective.advantages)(agent.critic),
-        optimizers=optimizers,
-        frozen=agent.frozen,
-        record=Record(folder),
-        checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
-        config=cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)),
-        max_grad_norm=cfg.objective.max_grad_norm,
-        step_size_schedule=instantiate(cfg.optimizer.schedule),
-        autocast=cfg.autocast,
-        device=cfg.device,
-        checkpoint_interval=cfg.checkpoint_interval,
-        progress_bar=cfg.progress_bar,
-        **training,
-    )
+USUAL = ("collector", "evaluation")
+"""Settings that not all runs had from the beginning."""
 
 
 def train(cfg: DictConfig) -> Path:
@@ -133,7 +42,7 @@ def train(cfg: DictConfig) -> Path:
     trainer = _trainer(cfg, folder, _pretrained(cfg))
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
-    _write(origin.origin(cfg.device), folder / origin.FILE)
+    _write(origin(cfg.device), folder / ORIGIN)
     # Last, because it is what says that there is a run to resume.
     OmegaConf.save(cfg, folder / CONFIG, resolve=True)
     _finish(trainer, cfg, folder)
@@ -163,7 +72,7 @@ def resume(folder: Path) -> Path:
 
 
 def configuration(folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder``; what it has not of ``evaluation`` is as in a new run.
+    """Return the configuration of the run in ``folder``; if it is from before ``USUAL``, they are as in a new run.
 
     Raises:
         ValueError: If the folder holds no run.
@@ -171,8 +80,9 @@ def configuration(folder: Path) -> DictConfig:
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
-    if "evaluation" not in cfg:
-        cfg.evaluation = _usual_evaluation(cfg.task.name)
+    if missing := [key for key in USUAL if key not in cfg]:
+        usual = _usual(cfg.task.name)
+        cfg.update({key: usual[key] for key in missing})
     return cfg
 
 
@@ -244,7 +154,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
         ValueError: If there is no checkpoint or it is damaged.
     """
     cfg = OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
-    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual_evaluation(cfg.task.name), resolve=True)
+    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual(cfg.task.name)["evaluation"], resolve=True)
     environment = settings["environment"]
     numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
     return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
@@ -297,10 +207,9 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
     if cfg.torch_threads:
         torch.set_num_threads(cfg.torch_threads)
     torch.manual_seed(cfg.seed)
-    on_gpu = torch.device(cfg.device).type == "cuda"
-    env = make_env(cfg, num_envs=cfg.training.num_envs, seed=cfg.seed, pin_memory=on_gpu)
-    agent = make_agent(cfg, env, pretrained)
-    return make_trainer(cfg, agent, env, folder)
+    collection = make_collection(cfg)
+    agent = make_agent(cfg, collection.env, pretrained)
+    return make_trainer(cfg, agent, collection, folder)
 
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
@@ -312,11 +221,12 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
         _write(numbers, folder / EVALUATION)
 
 
-def _usual_evaluation(task: str) -> DictConfig:
-    """Return how a new run of a task is evaluated."""
+def _usual(task: str) -> dict[str, DictConfig]:
+    """Return what a new run on a task has of ``USUAL``."""
     begun = GlobalHydra.instance().is_initialized()  # on the command line
     with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", [f"task={task}"]).evaluation
+        cfg = compose("train", [f"task={task}"])
+        return {key: cfg[key] for key in USUAL}
 
 
 def _write(content: dict[str, Any], path: Path) -> None:

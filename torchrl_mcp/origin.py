@@ -15,7 +15,6 @@ from hydra.core.hydra_config import HydraConfig
 
 from torchrl_mcp import __version__
 
-FILE = "origin.json"
 PACKAGE = Path(__file__).resolve().parent
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from omegaconf import OmegaConf
 
-from torchrl_mcp import experiment
+from torchrl_mcp import assembly, experiment
 from torchrl_mcp.analysis.films import save_film
 from torchrl_mcp.builtin import locate
 from torchrl_mcp.envs import CharacterEnv
@@ -65,7 +65,7 @@ def play(arguments: argparse.Namespace) -> None:
             play_in_window(Player(policy, env, **look))
 
 
-def _restored(path: Path, seed: int, overrides: list[str]) -> tuple[experiment.Agent, CharacterEnv]:
+def _restored(path: Path, seed: int, overrides: list[str]) -> tuple[assembly.Agent, CharacterEnv]:
     """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
     arguments = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(overrides)))
     try:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_mcp import checkpoint, experiment
+from torchrl_mcp import assembly, checkpoint, experiment
 from torchrl_mcp.actors import PRIMITIVES
 from torchrl_mcp.analysis.exploration import Explorer, RandomSequence, fixed_latent, fixed_weights
 from torchrl_mcp.analysis.holdout import Trajectories, play_directions
@@ -80,7 +80,7 @@ def walk_of(
 
 
 @torch.no_grad()
-def untrained(cfg: DictConfig, agent: experiment.Agent, env: CharacterEnv, walk: Walk) -> Mapping[str, float]:
+def untrained(cfg: DictConfig, agent: assembly.Agent, env: CharacterEnv, walk: Walk) -> Mapping[str, float]:
     """Return how far networks before training specialise in the states of a walk: means of :data:`UNTRAINED` of them.
 
     Args:
@@ -93,7 +93,7 @@ def untrained(cfg: DictConfig, agent: experiment.Agent, env: CharacterEnv, walk:
     for seed in range(UNTRAINED):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            fresh = experiment.make_agent(cfg, env)
+            fresh = assembly.make_agent(cfg, env)
         for name in ("observation_normaliser", "goal_normaliser"):
             fresh.parts[name].load_state_dict(agent.parts[name].state_dict())
         said = fresh.actor.policy(walk.inputs.clone())
@@ -102,7 +102,7 @@ def untrained(cfg: DictConfig, agent: experiment.Agent, env: CharacterEnv, walk:
     return {key: statistics.mean(row[key] for row in numbers) for key in numbers[0]}
 
 
-def explorer(cfg: DictConfig, agent: experiment.Agent, num: int, generator: torch.Generator) -> Explorer:
+def explorer(cfg: DictConfig, agent: assembly.Agent, num: int, generator: torch.Generator) -> Explorer:
     """Return how a method explores at random, as in Section 5.3.
 
     Args:
@@ -159,7 +159,7 @@ def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[Cha
         start = {"qpos": moment.qpos, "qvel": moment.qvel}
     else:
         plain = OmegaConf.merge(cfg, {"transforms": []})
-        env = cast("CharacterEnv", experiment.make_env(cast("DictConfig", plain), num_envs=num, seed=seed))
+        env = cast("CharacterEnv", assembly.make_env(cast("DictConfig", plain), num_envs=num, seed=seed))
         env.reset()
         start = {key: env.get_state()[key][:1].repeat(num, 1) for key in ("qpos", "qvel")}
     env.max_episode_steps = round(seconds / env.control_timestep)

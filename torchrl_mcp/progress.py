@@ -8,9 +8,6 @@ from typing import Any
 
 from torch import nn
 
-SECTIONS = ("physics", "forward", "update")
-"""Where the time of training should go; the rest is overhead."""
-
 
 @dataclass
 class Progress:
@@ -31,7 +28,7 @@ class Progress:
 
 @dataclass
 class Stopwatch:
-    """Wall-clock seconds by section."""
+    """Wall-clock seconds by section. Time that belongs to none is overhead."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 

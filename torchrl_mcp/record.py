@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
 
-METRICS = "metrics.csv"
+from torchrl_mcp.run_folder import METRICS
 
 
 class Record:

@@ -29,13 +29,14 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from torchrl_mcp import experiment
-from torchrl_mcp.sweep_status import LOG, MANIFEST, overview, write_manifest
+from torchrl_mcp.run_folder import CONFIG, LOG
+from torchrl_mcp.sweep_status import MANIFEST, overview, write_manifest
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
 TRANSFER_ONLY = {"exploration", "pretrained", "transfer.freeze", "transfer.keep"}
 """Settings that make no difference to pre-training, or that it refuses."""
-INDIFFERENT = {"checkpoint_interval", "device", "keep_checkpoints", "logger", "num_threads", "progress_bar", "resume",
-               "torch_threads"}  # fmt: skip
+INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
+               "progress_bar", "resume", "torch_threads"}  # fmt: skip
 """Settings that may differ from those that a run began with."""
 
 Settings = Mapping[str, str]
@@ -189,7 +190,7 @@ def require_own_folders(jobs: Sequence[Job]) -> None:
 
 def conflict(job: Job) -> str | None:
     """Return what keeps a job from its folder, if anything."""
-    if not (job.folder / experiment.CONFIG).exists():
+    if not (job.folder / CONFIG).exists():
         return None
     held: Any = OmegaConf.to_container(experiment.configuration(job.folder), resolve=True)
     if not (changed := differences(held, job.config)):
@@ -226,7 +227,7 @@ def run(cfg: DictConfig) -> None:
         fcntl.flock(log, fcntl.LOCK_EX)
         with redirect_stdout(log), redirect_stderr(log):
             try:
-                if (folder / experiment.CONFIG).exists():
+                if (folder / CONFIG).exists():
                     experiment.resume(folder)
                 else:
                     experiment.train(cfg)
@@ -237,7 +238,7 @@ def run(cfg: DictConfig) -> None:
 
 def is_complete(folder: Path) -> bool:
     """Tell whether a folder holds a run that has ended and been evaluated."""
-    return (folder / experiment.CONFIG).exists() and experiment.is_complete(folder)
+    return (folder / CONFIG).exists() and experiment.is_complete(folder)
 
 
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:

@@ -23,10 +23,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from torchrl_mcp.experiment import CONFIG, EVALUATION
-from torchrl_mcp.record import METRICS
+from torchrl_mcp.run_folder import CONFIG, EVALUATION, LOG, METRICS
 
-LOG = "train.log"
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
 INTERVAL = 1.0

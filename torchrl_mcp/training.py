@@ -1,8 +1,7 @@
 """The training loop: collect, estimate advantages, update, record. One loop for every method."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -13,18 +12,16 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
-from torchrl.collectors import Collector
 from torchrl.objectives import KLAdaptiveLR, LossModule
 from tqdm import tqdm
 
 from torchrl_mcp.actors import Actor
 from torchrl_mcp.checkpoint import load, run_checkpoint
+from torchrl_mcp.collection import Collection
 from torchrl_mcp.diagnostics import diagnostics
-from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.episodes import EpisodeStatistics
-from torchrl_mcp.memory import TransformedCharacterEnv
 from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.progress import SECTIONS, Progress, Stopwatch
+from torchrl_mcp.progress import Progress, Stopwatch
 from torchrl_mcp.record import Record
 from torchrl_mcp.transfer import FrozenParts
 
@@ -40,10 +37,10 @@ class Estimator(Protocol):
 
 
 class Trainer:
-    """Policy optimisation of an actor and a critic in one batch of environments.
+    """Policy optimisation of an actor and a critic.
 
     Args:
-        env: Environments, batch size ``[N]``, with or without transforms.
+        collection: Where trajectories come from, of ``N`` environments.
         parts: All parts of the agent by name.
         actor: The actor over those parts.
         critic: The value function over those parts.
@@ -73,7 +70,7 @@ class Trainer:
     def __init__(
         self,
         *,
-        env: CharacterEnv | TransformedCharacterEnv,
+        collection: Collection,
         parts: nn.ModuleDict,
         actor: Actor,
         critic: TensorDictModuleBase,
@@ -95,12 +92,13 @@ class Trainer:
         checkpoint_interval: int,
         progress_bar: bool = True,
     ) -> None:
-        if frames_per_batch % env.batch_size[0] or frames_per_batch % minibatch_size:
+        num_envs = collection.num_envs
+        if frames_per_batch % num_envs or frames_per_batch % minibatch_size:
             raise ValueError(
-                f"frames_per_batch={frames_per_batch} must be a multiple of num_envs={env.batch_size[0]} and of "
+                f"frames_per_batch={frames_per_batch} must be a multiple of num_envs={num_envs} and of "
                 f"minibatch_size={minibatch_size}"
             )
-        self.env, self.parts, self.actor, self.critic, self.loss = env, parts, actor, critic, loss
+        self.collection, self.parts, self.actor, self.critic, self.loss = collection, parts, actor, critic, loss
         self.advantages = advantages
         self.optimizers = dict(optimizers)
         self.schedule = (
@@ -111,11 +109,11 @@ class Trainer:
         self.minibatch_size, self.num_epochs, self.max_grad_norm = minibatch_size, num_epochs, max_grad_norm
         self.device, self.autocast = torch.device(device), autocast
         self.checkpoint_interval, self.progress_bar = checkpoint_interval, progress_bar
-        self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(env.batch_size[0]), Stopwatch()
+        self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(num_envs), Stopwatch()
         self.checkpoint: Checkpoint = run_checkpoint(
             parts,
             **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()},
-            environment=env,
+            environment=collection,
             episodes=self.episodes,
             frozen=frozen,
             progress=self.progress,
@@ -124,17 +122,20 @@ class Trainer:
 
     def run(self) -> None:
         """Train until ``total_frames``, saving as it goes."""
-        collector = self._collector()
-        batches = iter(collector)
+        self.collection.start(
+            self._behaviour(),
+            frames_per_batch=self.frames_per_batch,
+            device=self.device,
+            autocast=self.autocast,
+            stopwatch=self.stopwatch,
+        )
         with tqdm(
             total=self.total_frames, initial=self.progress.frames, unit="step", disable=not self.progress_bar
         ) as bar:
             while self.progress.frames < self.total_frames:
-                start, physics = time.perf_counter(), self.env.physics_seconds
+                start = time.perf_counter()
                 self.stopwatch.seconds.clear()
-                with self._precision(), _one_thread():
-                    batch = next(batches)
-                self.stopwatch.add("physics", self.env.physics_seconds - physics)
+                batch = self.collection.collect()
                 metrics = self._episode_metrics(batch) | diagnostics(self.actor, batch)
                 with self.stopwatch("update"):
                     with self._precision():
@@ -145,7 +146,7 @@ class Trainer:
                 self._advance(metrics, time.perf_counter() - start)
                 bar.set_postfix_str(self._summary(metrics), refresh=False)
                 bar.update(batch.numel())
-        collector.shutdown()
+        self.collection.stop()
 
     def restore(self, path: Path) -> None:
         """Continue from the checkpoint file ``path``, to the same numbers as if nothing had happened.
@@ -160,26 +161,11 @@ class Trainer:
         """Write a checkpoint."""
         self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
 
-    def _collector(self) -> Collector:
+    def _behaviour(self) -> TensorDictModuleBase:
+        """Return the policy as it collects: what it writes is what the loss reads, and no more."""
         kept = {"action", self.actor.log_prob, *self.actor.stored}
         keys = [key for key in dict.fromkeys(self.actor.policy.out_keys) if key in kept]
-        behaviour = TensorDictSequential(self.actor.policy, selected_out_keys=keys)
-        self.stopwatch.watch("forward", behaviour)
-        random = GlobalRNGState().state_dict()
-        collector = Collector(
-            self.env,
-            behaviour,
-            frames_per_batch=self.frames_per_batch,
-            total_frames=-1,
-            env_device="cpu",
-            policy_device=self.device,
-            storing_device=self.device,
-            auto_register_policy_transforms=False,
-            track_traj_ids=False,
-        )
-        # Setting up a collector draws random numbers, which a resumed run must not notice.
-        GlobalRNGState().load_state_dict(random)
-        return collector
+        return TensorDictSequential(self.actor.policy, selected_out_keys=keys)
 
     def _update(self, samples: TensorDictBase) -> dict[str, float]:
         """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports."""
@@ -236,9 +222,9 @@ class Trainer:
         return {
             "episode/count": len(returns),
             "episode/return": returns.mean().item(),
-            "episode/normalised_return": self.env.normalised_return(returns).mean().item(),
+            "episode/normalised_return": self.collection.env.normalised_return(returns).mean().item(),
             "episode/length": lengths.mean().item(),
-            "episode/faults": self.env.num_faults,
+            **self.collection.measures(),
             "reward": batch["next", "reward"].mean().item(),
             **self._task_metrics(batch),
         }
@@ -246,7 +232,7 @@ class Trainer:
     def _task_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         """Mean of all that the task observes for the record."""
         metrics: dict[str, float] = {}
-        for key, names in self.env.measure_names.items():
+        for key, names in self.collection.env.measure_names.items():
             means = batch["next", key].float().flatten(0, -2).mean(0)
             metrics |= {f"task/{name}": mean for name, mean in zip(names, means.tolist(), strict=True)}
         return metrics
@@ -257,7 +243,7 @@ class Trainer:
         progress.iteration += 1
         progress.frames += self.frames_per_batch
         progress.seconds += seconds
-        shares = {section: self.stopwatch.seconds.get(section, 0.0) / seconds for section in SECTIONS}
+        shares = {section: spent / seconds for section, spent in self.stopwatch.seconds.items()}
         shares["other"] = 1 - sum(shares.values())
         metrics |= {f"time/{section}": share for section, share in shares.items()}
         metrics["time/steps_per_second"] = self.frames_per_batch / seconds
@@ -266,26 +252,14 @@ class Trainer:
             self.save()
 
     def _summary(self, metrics: dict[str, float]) -> str:
-        shares = " ".join(f"{section} {metrics[f'time/{section}']:.0%}" for section in (*SECTIONS, "other"))
+        shares = " ".join(
+            f"{section} {metrics[f'time/{section}']:.0%}" for section in (*self.stopwatch.seconds, "other")
+        )
         return f"return {metrics['episode/normalised_return']:.3f} | {shares}"
 
     def _precision(self) -> torch.autocast:
         # Entered anew for every use: within one context autocast keeps its copies of the weights.
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to the calling thread, and the processors to physics.
-
-    OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step takes.
-    """
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)
 
 
 def _spread(distribution: Distribution) -> dict[str, float]:

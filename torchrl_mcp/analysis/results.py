@@ -14,12 +14,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
-from torchrl_mcp.record import METRICS
+from torchrl_mcp.run_folder import CONFIG, EVALUATION, METRICS, ORIGIN
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
 
-CONFIG, EVALUATION, ORIGIN = "config.yaml", "evaluation.json", "origin.json"
 
 REQUIRED = {
     "task.name": str,
