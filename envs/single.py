@@ -15,7 +15,8 @@ from torchrl_mcp.envs.base import CharacterEnv
 class SingleEnv(gymnasium.Env):
     """A single simulation of a task with Gymnasium's interface; training is several times faster with many at once.
 
-    The observation is a dictionary of ``observation`` and ``goal``.
+    The observation is a dictionary of ``observation`` and ``goal``; ``info`` has what the task measures, such as
+    ``success`` of carrying and dribbling.
 
     Args:
         task: The task's class.
@@ -51,14 +52,15 @@ class SingleEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
-        return self._observed(self.env.reset()), {}
+        outcome = self.env.reset()
+        return self._observed(outcome), self._measured(outcome)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Take an action."""
         given = TensorDict({"action": torch.as_tensor(action, dtype=torch.float32).unsqueeze(0)}, [1])
         outcome = self.env.step(given)["next"]
         terminated, truncated = outcome["terminated"].item(), outcome["truncated"].item()
-        return self._observed(outcome), outcome["reward"].item(), terminated, truncated, {}
+        return self._observed(outcome), outcome["reward"].item(), terminated, truncated, self._measured(outcome)
 
     def render(self) -> np.ndarray | None:
         """Draw the simulation, shape ``(height, width, 3)``, uint8, if ``render_mode`` asks for it."""
@@ -67,6 +69,12 @@ class SingleEnv(gymnasium.Env):
     def close(self) -> None:
         """Free what drawing holds."""
         self.env.close()
+
+    def _measured(self, outcome: TensorDictBase) -> dict[str, float]:
+        measures: dict[str, float] = {}
+        for key, names in self.env.measure_names.items():
+            measures |= zip(names, outcome[key][0].tolist(), strict=True)
+        return measures
 
     def _observed(self, outcome: TensorDictBase) -> dict[str, np.ndarray]:
         return {key: outcome[key][0].numpy() for key in ("observation", "goal")}

@@ -5,6 +5,7 @@ import pytest
 from hydra import compose, initialize_config_module
 
 import torchrl_mcp.conf
+from torchrl_mcp import sweep
 from torchrl_mcp.train import main, suggestions
 
 CONF = Path(torchrl_mcp.conf.__file__).parent
@@ -75,6 +76,7 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
         (["benchmark=mixer", "sead=3"], "nearest are: seed"),
         (["benchmark=mixr"], "exploration\n\tfreeze\n\tmixer"),
         (["benchmark=mixer", "mixer=aditive"], "additive\n\tmultiplicative"),
+        (["benchmark=mixer", "--cfg", "job"], "not --cfg"),
     ],
 )
 def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, capsys, arguments, answer):
@@ -85,3 +87,15 @@ def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, ca
     said = capsys.readouterr().err + str(stop.value.code)
     assert answer in said
     assert "Traceback" not in said
+
+
+def test_a_benchmark_of_your_own_is_found(monkeypatch, tmp_path):
+    (tmp_path / "own" / "benchmark").mkdir(parents=True)
+    (tmp_path / "own" / "benchmark" / "mine.yaml").write_text("rows: [{method: [scratch]}]\nparams: {seed: '4'}\n")
+    planned = []
+    monkeypatch.setattr(sweep, "launch", lambda jobs, launcher: planned.extend(jobs) or jobs)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "--config-dir", "own", "benchmark=mine"])
+    with pytest.raises(SystemExit, match="scratch"):  # what was planned has not been done
+        main()
+    assert [(job.config["method"]["name"], job.config["seed"]) for job in planned] == [("scratch", 4)]

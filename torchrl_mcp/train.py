@@ -1,5 +1,6 @@
 """``torchrl-mcp-train``: train a method on a task, alone, in a Hydra multirun, or as a benchmark of many."""
 
+import argparse
 import difflib
 import sys
 from pathlib import Path
@@ -25,8 +26,15 @@ def run(cfg: DictConfig) -> None:
 
 def run_benchmark(arguments: list[str]) -> None:
     """Run many runs, or what is left of them."""
+    parser = argparse.ArgumentParser("torchrl-mcp-train", add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", "-cd", type=Path)
+    options, settings = parser.parse_known_args(arguments)
+    if unknown := [setting for setting in settings if setting.startswith("-")]:
+        sys.exit(f"torchrl-mcp-train: a benchmark knows settings and --config-dir, not {' '.join(unknown)}")
+    if options.config_dir:
+        settings.append(f"hydra.searchpath=[file://{options.config_dir.resolve()}]")
     try:
-        sweep.main(arguments)
+        sweep.main(settings)
     except HydraException as error:
         print(error, file=sys.stderr)
         sys.exit(1)

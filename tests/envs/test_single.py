@@ -24,6 +24,13 @@ def test_gymnasium_finds_nothing_wrong(name):
         check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
 
 
+def test_the_info_tells_success():
+    env = gymnasium.make("torchrl_mcp/Dribble-Biped-v0")
+    _, info = env.reset(seed=0)
+    assert info == {"success": 0.0}
+    assert env.step(env.action_space.sample())[-1].keys() == {"success"}
+
+
 def test_a_single_environment_is_the_batch_of_one():
     env, batch = gymnasium.make("torchrl_mcp/Heading-Biped-v0", max_turn=0.1), Heading("biped", 1, max_turn=0.1, seed=3)
     state, (observation, _) = batch.reset(), env.reset(seed=3)
