@@ -1,0 +1,88 @@
+"""The methods on a task at equal budgets: what came of the runs of a benchmark, as a table and learning curves.
+
+    torchrl-mcp-train benchmark=table2 task=heading character=biped preset=comparison benchmark.pretrain_seed=0 seed=0,1
+    python benchmarks/comparison.py runs --task heading --character biped
+
+It writes a row for every complete run and mode to ``results/TASK_CHARACTER_methods.csv``, with what it takes to make it
+again, and the curves beside it. A page with more is written by ``torchrl-mcp-report runs``.
+"""
+
+import argparse
+import csv
+import shlex
+from pathlib import Path
+from typing import Any
+
+from torchrl_mcp.analysis.comparison import Cell, cells
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
+from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.analysis.results import MODES, Run, find_runs
+from torchrl_mcp.analysis.sections import method_title
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def main() -> None:
+    """Read the runs and write what came of them."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("runs", type=Path, help="the benchmark's run_root")
+    parser.add_argument("--task", default="heading")
+    parser.add_argument("--character", default="biped")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder to write to")
+    arguments = parser.parse_args()
+    runs, _ = find_runs([arguments.runs])
+    place = arguments.task, arguments.character
+    found = [cell for cell in cells(runs) if cell.place == place and cell.stage == "transfer" and cell.complete]
+    steps = {run.path.resolve(): run.frames for run in runs}
+    rows = [row(cell, run, mode, steps) for cell in found for run in cell.complete for mode in MODES]
+    stem = arguments.output / f"{arguments.task}_{arguments.character}_methods"
+    with stem.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    curves = learning_curves({method_title(cell.method): [run.path for run in cell.complete] for cell in found})
+    write_curves(curves, stem.with_name(f"{stem.name}_curves.csv"))
+    save_figure(draw_curves(curves), stem.with_name(f"{stem.name}_curves"))
+    for cell in found:
+        print(line(cell))
+
+
+def row(cell: Cell, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
+    """Return the facts of a run and its numbers in a mode."""
+    numbers, before = run.evaluation[mode], run.settings.get("pretrained")
+    machine, command = run.origin.get("machine", {}), run.origin.get("command", [])
+    return {
+        "method": cell.method,
+        "seed": run.seed,
+        "pretraining_steps": steps[Path(before).resolve()] if before else 0,
+        "steps": run.frames,
+        "mode": mode,
+        **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
+        "episodes": numbers["episodes"],
+        "paper": paper(cell),
+        "seconds": round(run.seconds),
+        "preset": run.preset,
+        "commit": run.commit,
+        **{key: machine.get(key, "") for key in ("processor", "cores", "torch", "mujoco")},
+        "command": shlex.join(command),
+    }
+
+
+def line(cell: Cell) -> str:
+    """Return a row of a table in Markdown."""
+    numbers = []
+    for mode in MODES:
+        spread = f" +- {cell.deviation(mode):.3f}" if len(cell.complete) > 1 else ""
+        numbers.append(f"{sum(cell.returns(mode)) / len(cell.complete):.3f}{spread}")
+    fallen = [run.evaluation["deterministic"]["terminated"] for run in cell.complete]
+    numbers.insert(1, f"{sum(fallen) / len(fallen):.0%}")
+    return f"| {method_title(cell.method)} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
+
+
+def paper(cell: Cell) -> str:
+    """Return the paper's figure, if it has one."""
+    return f"{cell.reported.mean:.3f} +- {cell.reported.std:.3f}" if cell.reported else ""
+
+
+if __name__ == "__main__":
+    main()
