@@ -34,8 +34,8 @@ from typing import Any, NamedTuple
 
 import mujoco
 import torch
+from report import about, table, write
 from torch import Tensor
-from training_throughput import about, table, write
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.pd_character import add_ground

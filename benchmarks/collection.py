@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import mean, median
 from tempfile import TemporaryDirectory
 
-from training_throughput import about, table, write
+from report import about, table, write
 
 from torchrl_mcp.analysis.curves import read_metrics
 

@@ -23,8 +23,9 @@ from typing import Any, NamedTuple
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from report import about, table, write
 from tensordict import TensorDict, TensorDictBase
-from training_throughput import about, configuration, table, write
+from training_throughput import configuration
 
 from torchrl_mcp import assembly
 from torchrl_mcp.collection import LocalCollection
@@ -64,7 +65,7 @@ def make_trainer(cfg: DictConfig, sizes: Sizes, folder: Path, *, reuse: bool) ->
 @torch.no_grad()
 def collect(trainer: Trainer, sizes: Sizes) -> TensorDictBase:
     """Return a batch ``(N, T)`` as collection and estimation of advantages leave it, of random states."""
-    num_envs = trainer.env.batch_size[0]
+    num_envs = trainer.collection.num_envs
     steps = []
     for _ in range(trainer.frames_per_batch // num_envs):
         state = {"observation": torch.randn(num_envs, sizes.observation), "goal": torch.randn(num_envs, sizes.goal)}

@@ -29,7 +29,7 @@ import torch
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from mujoco.batch import Batch
-from training_throughput import about, table, write
+from report import about, table, write
 
 from torchrl_mcp import envs
 

@@ -16,17 +16,13 @@ median of the rounds'.
 """
 
 import argparse
-import csv
-import importlib.metadata
 import importlib.util
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
 from contextlib import suppress
-from datetime import date
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -34,6 +30,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
+from report import about, table, write
 
 SCRIPT = Path(__file__).resolve()
 RESULTS = SCRIPT.parent / "results" / "training_throughput.csv"
@@ -228,31 +225,6 @@ def summaries(iterations: dict[str, list[Iteration]], frames: int) -> list[dict[
     return rows
 
 
-def about() -> dict[str, str | int]:
-    """Return what the numbers were measured on, with what, and when."""
-    cpu = platform.processor()
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    commit = ""
-    with suppress(OSError):
-        command = ["git", "rev-parse", "--short", "HEAD"]
-        commit = subprocess.run(command, capture_output=True, text=True, cwd=SCRIPT.parent).stdout.strip()
-    packages = ["torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy", "stable-baselines3"]
-    versions = {}
-    for package in packages:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
-    return {
-        "commit": commit,
-        "date": date.today().isoformat(),
-        "cpu": cpu,
-        "cores": os.cpu_count() or 1,
-        "python": platform.python_version(),
-        **versions,
-    }
-
-
 def available(contenders: list[str]) -> list[str]:
     """Leave out what is not installed, and say so."""
     if importlib.util.find_spec("stable_baselines3"):
@@ -261,22 +233,6 @@ def available(contenders: list[str]) -> list[str]:
         if name.startswith("sb3"):
             print(f"{name}: skipped, for stable-baselines3 is not installed")
     return [name for name in contenders if not name.startswith("sb3")]
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows of one set of keys as text, a line each."""
-    lines = [list(rows[0]), *([str(value) if value != "" else "-" for value in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
-
-
-def write(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write rows of one set of keys as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def main() -> None:

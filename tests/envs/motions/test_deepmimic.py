@@ -1,17 +1,14 @@
+"""Files of DeepMimic become clips: axes, joints, times and loops."""
+
 import json
-from contextlib import suppress
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.motions import textfile
 from torchrl_mcp.envs.motions.deepmimic import read_deepmimic
-from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.joints import character_model
 
 BALLS = [1.0, 0.0, 0.0, 0.0]
@@ -35,21 +32,12 @@ def quaternion(axis, degrees):
 
 @pytest.fixture
 def write(tmp_path):
-    def write(frames, loop="none", text=None):
+    def write(frames, loop="none"):
         path = tmp_path / "motion.txt"
-        path.write_text(json.dumps({"Loop": loop, "Frames": frames}) if text is None else text)
+        path.write_text(json.dumps({"Loop": loop, "Frames": frames}))
         return path
 
     return write
-
-
-def bodies(clip, index=0):
-    """Body positions by name, from MuJoCo."""
-    model = character_model(clip.character)
-    data = mujoco.MjData(model)
-    data.qpos = clip.qpos[index].numpy()
-    mujoco.mj_kinematics(model, data)
-    return {model.body(i).name: data.xpos[i].copy() for i in range(1, model.nbody)}
 
 
 def of_joint(clip, name, index=0):
@@ -57,9 +45,9 @@ def of_joint(clip, name, index=0):
     return clip.qpos[index, joint.qposadr[0] :][: 4 if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL else 1].tolist()
 
 
-def test_standing_faces_forward_with_the_soles_on_the_ground(write):
+def test_standing_faces_forward_with_the_soles_on_the_ground(write, kinematics):
     clip = read_deepmimic(write([frame(HUMANOID), frame(HUMANOID)]), "humanoid")
-    found = bodies(clip)
+    found, _ = kinematics(clip)
     np.testing.assert_allclose(found["root"], [0, 0, 0.881416], atol=1e-6)
     assert found["right_hip"][1] < 0 < found["left_hip"][1]
     np.testing.assert_allclose(found["left_ankle"], [0, 0.084887, 0.05], atol=1e-6)
@@ -83,14 +71,16 @@ def test_the_root_moves_forward_up_and_to_the_right(write):
         ("right_elbow", np.pi / 2, "right_wrist", [1, 0, 0]),  # forward
     ],
 )
-def test_a_positive_rotation_about_an_axis_moves_the_limb_as_in_deepmimic(write, joint, rotation, body, direction):
-    found = bodies(read_deepmimic(write([frame(HUMANOID, **{joint: rotation})] * 2), "humanoid"))
+def test_a_positive_rotation_about_an_axis_moves_the_limb_as_in_deepmimic(
+    write, joint, rotation, body, direction, kinematics
+):
+    found, _ = kinematics(read_deepmimic(write([frame(HUMANOID, **{joint: rotation})] * 2), "humanoid"))
     moved = found[body] - found[joint]
     np.testing.assert_allclose(moved / np.linalg.norm(moved), direction, atol=1e-9)
 
 
-def test_a_turn_to_the_left_is_a_turn_to_the_left(write):
-    found = bodies(read_deepmimic(write([frame(HUMANOID, root=quaternion([0, 1, 0], 90))] * 2), "humanoid"))
+def test_a_turn_to_the_left_is_a_turn_to_the_left(write, kinematics):
+    found, _ = kinematics(read_deepmimic(write([frame(HUMANOID, root=quaternion([0, 1, 0], 90))] * 2), "humanoid"))
     np.testing.assert_allclose(found["left_hip"] - found["right_hip"], [-2 * 0.084887, 0, 0], atol=1e-9)
 
 
@@ -200,165 +190,3 @@ def test_the_mirror_image_of_a_file_is_the_mirror_image_of_the_clip(write, joint
     clip = read_deepmimic(write(frames), character)
     other = read_deepmimic(write([mirrored(columns, joints) for columns in frames]), character)
     torch.testing.assert_close(other.qpos, clip.mirrored().qpos, rtol=0, atol=1e-12)
-
-
-STANDING = [frame(HUMANOID)] * 3
-JUMP = [frame(HUMANOID), frame(HUMANOID, position=(9, 1, 0)), frame(HUMANOID, position=(9, 1, 0))]
-
-
-def lines(frames):
-    """JSON with one frame a line, the first on line 3."""
-    rows = ",\n".join(json.dumps(columns) for columns in frames)
-    return '{"Loop": "none",\n"Frames": [\n' + rows + "\n]}\n"
-
-
-def damaged(column, value, which=1):
-    frames = [list(columns) for columns in STANDING]
-    frames[which][column] = value
-    return lines(frames)
-
-
-WRONG = {
-    "empty": ("", 1, "is not JSON"),
-    "truncated": (lines(STANDING)[:-40], 5, "is not JSON"),
-    "binary": ("\x00\x01", 1, "is not JSON"),
-    "list": ("[1, 2]", 1, "no list of two or more"),
-    "no frames": ('{"Loop": "none"}', 1, "no list of two or more"),
-    "frames no list": ('{"Frames": 3}', 1, "no list of two or more"),
-    "one frame": (lines(STANDING[:1]), 1, "no list of two or more"),
-    "unknown loop": (lines(STANDING).replace("none", "sometimes"), 1, "'sometimes'"),
-    "loop a list": (lines(STANDING).replace('"none"', "[1]"), 1, "Loop"),
-    "other character": (lines([columns[:36] for columns in STANDING]), 3, "the first frame has 36 numbers"),
-    "frames of words": ('{"Frames":\n["a", "b"]}', 1, "the first frame has 0 numbers"),
-    "truncated row": (lines([STANDING[0], STANDING[1][:43], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
-    "row too short for a frame": (lines([STANDING[0], [7], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
-    "NaN": (damaged(20, float("nan")), 4, "frame 2 holds what is no number"),
-    "infinity": (damaged(2, float("inf"), 2), 5, "frame 3 holds what is no number"),
-    "overflow": (lines(STANDING).replace("0.9", "1e999", 1), 3, "frame 1 holds what is no number"),
-    "absurd number": (damaged(2, 10**400), 4, "frame 2 holds what is no number"),
-    "word": (damaged(2, "high"), 4, "frame 2 holds what is no number"),
-    "boolean": (damaged(2, True), 4, "frame 2 holds what is no number"),
-    "null": (damaged(2, None), 4, "frame 2 holds what is no number"),
-    "no duration": (damaged(0, 0.0), 4, "frame 2 lasts 0 s"),
-    "negative duration": (damaged(0, -0.1), 4, "frame 2 lasts -0.1 s"),
-    "endless duration": (damaged(0, 9e6), 4, "frame 2 ends after 9e\\+06 s, more than an hour"),
-    "no rotation": (damaged(4, 0.0), 4, "quaternion of the root in frame 2 has length 0"),
-    "jump": (lines(JUMP), 4, "the root jumps between frames 1 and 2"),
-    "nested": ("[" * 100_000, 1, "is not JSON of a motion"),
-    "digits": ('{"Frames": [[' + "9" * 5000 + "]]}", 1, "is not JSON of a motion"),
-}
-
-
-@pytest.mark.parametrize(("text", "line", "message"), WRONG.values(), ids=WRONG)
-def test_what_is_wrong_is_said_with_file_and_line(write, text, line, message):
-    path = write(None, text=text)
-    with pytest.raises(MotionFormatError, match=message) as caught:
-        read_deepmimic(path, "humanoid")
-    assert str(caught.value).startswith(f"{path}:{line}: ")
-
-
-def test_a_file_too_large_to_be_a_motion_is_not_parsed(write, monkeypatch):
-    monkeypatch.setattr(textfile, "LARGEST_FILE", 2**20)
-    with pytest.raises(MotionFormatError, match="larger than 1 MiB"):
-        read_deepmimic(write(None, text="[]," * 2**19), "humanoid")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"character": "trex"}, "character='trex' has not the joints of a human body"),
-        ({"rate": 0}, "rate=0 leaves less than two frames"),
-        ({"rate": 1e9}, "rate=1000000000.0 leaves less"),
-        ({"fps": float("nan")}, "fps=nan is no frame rate"),
-    ],
-)
-def test_arguments_out_of_range_are_named(write, options, message):
-    with pytest.raises(ValueError, match=message):
-        read_deepmimic(write(STANDING), **{"character": "humanoid", **options})
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
-    max_leaves=5,
-)
-
-
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 43), VALUES), max_size=3), VALUES, st.integers(0, 3000))
-def test_no_damage_raises_another_error(tmp_path_factory, damages, loop, cut):
-    frames = [list(columns) for columns in STANDING]
-    for which, column, value in damages:
-        frames[which][column] = value
-    path = tmp_path_factory.getbasetemp() / "damaged.txt"
-    path.write_text(json.dumps({"Loop": loop, "Frames": frames})[: 3000 - cut])
-    with suppress(MotionFormatError):
-        read_deepmimic(path, "humanoid")
-    path.write_text(json.dumps({"Loop": "wrap", "Frames": frames}))
-    with suppress(MotionFormatError):
-        read_deepmimic(path, "biped")
-
-
-FILES = {
-    "deepmimic/humanoid3d_walk.txt": (1.27, True),
-    "deepmimic/humanoid3d_jog.txt": (0.83, True),
-    "deepmimic/humanoid3d_long_walk1.txt": (32.79, False),
-    "deepmimic/humanoid3d_long_walk2.txt": (24.56, False),
-    "deepmimic/humanoid3d_long_walk3.txt": (17.74, False),
-    "sfu/0005_Walking001_retargeted_deepmimic_60hz.txt": (39.08, False),
-    "biped/biped3d_walk.txt": (1.0, True),
-}
-
-
-@pytest.mark.parametrize("file", FILES)
-@pytest.mark.parametrize("character", ["humanoid", "biped"])
-def test_real_files_have_their_duration_and_stand_on_the_ground(mocap, file, character):
-    clip = read_deepmimic(mocap / file, character)
-    duration, loop = FILES[file]
-    assert clip.duration == pytest.approx(duration, abs=0.01)
-    assert clip.loop is loop
-    ankles = np.array([min(found["left_ankle"][2], found["right_ankle"][2]) for found in map_bodies(clip)])
-    assert 0.04 < np.quantile(ankles, 0.1) < 0.08
-    assert ankles.min() > 0.03
-
-
-def map_bodies(clip):
-    return [bodies(clip, index) for index in range(0, len(clip.qpos), 5)]
-
-
-@pytest.mark.parametrize(
-    ("file", "skeleton", "character"),
-    [
-        ("deepmimic/humanoid3d_long_walk3.txt", "deepmimic/humanoid3d_character.txt", "humanoid"),
-        ("biped/biped3d_walk.txt", "biped/biped3d_mocap_character.txt", "biped"),
-    ],
-)
-def test_bodies_are_where_the_skeleton_of_a_real_file_has_them(mocap, file, skeleton, character):
-    """All but the ends of the cycle of a loop, which are drawn together."""
-    joints = json.loads((mocap / skeleton).read_text())["Skeleton"]["Joints"]
-    frames = json.loads((mocap / file).read_text())["Frames"]
-    step = max(1, len(frames) // 30)
-    clip = read_deepmimic(mocap / file, character, rate=(len(frames) - 1) / sum(frame[0] for frame in frames[:-1]))
-    start = None
-    for index in range(0, len(frames), step):
-        places = skeleton_positions(joints, frames[index])
-        found = bodies(clip, index)
-        start = found["root"] - places["root"] if start is None else start
-        for name, place in places.items():
-            np.testing.assert_allclose(found[name], place + start, atol=2e-3 if clip.loop else 1e-6, err_msg=name)
-
-
-def skeleton_positions(joints, columns):
-    """Joint positions by rotation matrices, in our axes."""
-    axes = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    places, turns, rest = [np.array(columns[1:4])], [], list(columns[4:])
-    for joint in joints:
-        width = {"none": 4, "spherical": 4, "revolute": 1, "fixed": 0}[joint["Type"]]
-        own, rest = rest[:width], rest[width:]
-        turn = Rotation.from_quat(own, scalar_first=True) if width == 4 else Rotation.from_rotvec([0, 0, sum(own)])
-        parent = joint["Parent"]
-        offset = [joint["AttachX"], joint["AttachY"], joint["AttachZ"]]
-        if parent >= 0:
-            places.append(places[parent] + turns[parent].apply(offset))
-            turn = turns[parent] * turn
-        turns.append(turn)
-    return {joint["Name"]: axes @ place for joint, place in zip(joints, places, strict=True)}

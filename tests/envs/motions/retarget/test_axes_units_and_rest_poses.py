@@ -1,0 +1,88 @@
+"""The same motion gives the same clip, whatever axes, angles, unit and rest pose its file has."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.motions.joints import character_model
+
+AXES = {
+    "z up, x forward": np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "z up, y back": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x up": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+}
+Z = np.array([0, 0, 1])
+
+
+@pytest.fixture
+def splayed(skeleton, about):
+    """The body with its legs turned outwards by 20 degrees in the rest pose."""
+
+    def spread(name, offset):
+        turn = about(Z, 20 if name.startswith("Left") else -20)
+        return tuple(turn.apply(offset)) if re.fullmatch("(Left|Right)(Leg|Foot|Toe)", name) else offset
+
+    return [(name, parent, spread(name, offset)) for name, parent, offset in skeleton]
+
+
+@pytest.fixture
+def own_frames(skeleton, about):
+    """Each joint with axes of its own, as some programs write them: the rest pose is then no pose at all."""
+    names = [name for name, _, _ in skeleton]
+    return {name: about([index % 3, 1, index % 5 - 2], 40 * index) for index, name in enumerate(names)}
+
+
+@pytest.mark.filterwarnings("ignore:Gimbal lock")
+@pytest.mark.parametrize("axes", AXES.values(), ids=AXES)
+@pytest.mark.parametrize("order", ["XYZ", "YXZ"])
+def test_neither_axes_nor_orders_matter(load, axes, order, any_pose, arms_down):
+    poses, path = [arms_down(), any_pose, any_pose], [(0, 0.9, 0), (0.1, 0.8, 0.2), (0.1, 0.8, 0.2)]
+    expected = load(poses, path=path, fps=5.0)
+    found = load(poses, path=path, fps=5.0, axes=axes, order=order)
+    torch.testing.assert_close(found.qpos, expected.qpos, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [(0.01, None), (0.001, None), (0.0254, None), (0.0254 / 0.45, None), (0.3048, 0.3048)]
+)
+def test_the_unit_is_known_by_the_length_of_the_legs_or_said(load, unit, scale, any_pose):
+    expected = load([any_pose] * 2)
+    torch.testing.assert_close(
+        load([any_pose] * 2, unit=unit, options={"scale": scale}).qpos, expected.qpos, rtol=0, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale", "length"), [(0.3048, None, "2.79 m"), (0.01, 0.0254, "2.16 m"), (1.0, 0.5, "0.425 m")]
+)
+def test_legs_of_an_impossible_length_are_refused(load, unit, scale, length):
+    with pytest.raises(MotionFormatError, match=rf"motion\.bvh: from hip to ankle .* {length}.*: give the scale"):
+        load([{}] * 2, unit=unit, options={"scale": scale})
+
+
+def test_legs_that_the_rest_pose_spreads_hang_straight_when_the_motion_closes_them(load, arms_down, splayed, about):
+    closed = arms_down(LeftUpLeg=about(Z, -20), RightUpLeg=about(Z, 20))
+    clip = load([closed] * 2, body=splayed)
+    expected = character_model("humanoid").qpos0
+    np.testing.assert_allclose(clip.qpos[0], expected, atol=1e-7)
+
+
+def test_a_rest_pose_that_does_not_stand_is_refused(load, own_frames):
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand .*rest frame"):
+        load([{}] * 2, frames=own_frames)
+
+
+def test_a_frame_in_which_the_body_stands_takes_the_place_of_the_rest_pose(load, any_pose, own_frames):
+    path = [(0, 0.9, 0), (0.1, 0.9, 0), (0.1, 0.9, 0)]
+    expected = load([{}, any_pose, any_pose], fps=2.0, path=path)
+    found = load([{}, any_pose, any_pose], fps=2.0, path=path, frames=own_frames, options={"rest_frame": 0})
+    torch.testing.assert_close(found.qpos, expected.qpos, rtol=0, atol=1e-7)
+
+
+def test_the_frame_that_stands_may_be_left_out(load, any_pose, own_frames):
+    expected = load([{}, any_pose, any_pose], fps=2.0, options={"skip": 1})
+    found = load([{}, any_pose, any_pose], fps=2.0, frames=own_frames, options={"skip": 1, "rest_frame": 0})
+    torch.testing.assert_close(found.qpos, expected.qpos, rtol=0, atol=1e-7)

@@ -1,0 +1,86 @@
+"""Joints are found by the names that many makers give them, or by a map."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+
+STUDIO = {
+    "UpLeg": "Thigh",
+    "Leg": "Calf",
+    "Foot": "Foot",
+    "Shoulder": "Clavicle",
+    "Arm": "UpperArm",
+    "ForeArm": "Forearm",
+}
+
+BIOVISION = {
+    "UpLeg": "Hip",
+    "Leg": "Knee",
+    "Foot": "Ankle",
+    "Shoulder": "Collar",
+    "Arm": "Shoulder",
+    "ForeArm": "Elbow",
+    "Hand": "Wrist",
+}
+
+ENGINE = {
+    "UpLeg": "thigh",
+    "Leg": "calf",
+    "Foot": "foot",
+    "Shoulder": "clavicle",
+    "Arm": "upperarm",
+    "ForeArm": "lowerarm",
+}
+
+CMU = {"UpLeg": "femur", "Leg": "tibia", "Foot": "foot", "Shoulder": "clavicle", "Arm": "humerus", "ForeArm": "radius"}
+
+
+def limbs(name, form, parts):
+    """Rename the joints of a limb."""
+    found = re.fullmatch("(Left|Right)(.*)", name)
+    if not found:
+        return name
+    long, part = found.groups()
+    return form.format(long=long, side=long[0], small=long[0].lower(), part=parts.get(part, part))
+
+
+CONVENTIONS = {
+    "prefixed": lambda name: f"mixamorig:{name}",
+    "3ds Max": lambda name: f"Bip01 {limbs(name, '{side} {part}', STUDIO)}",
+    "Biovision": lambda name: limbs(name, "{long}{part}", BIOVISION),
+    "SMPL": lambda name: limbs(name, "{side}_{part}", BIOVISION),
+    "engine": lambda name: limbs(name, "{part}_{small}", ENGINE),
+    "CMU": lambda name: limbs(name, "{small}{part}", CMU),
+}
+
+
+@pytest.mark.parametrize("rename", CONVENTIONS.values(), ids=CONVENTIONS)
+def test_joints_are_known_by_the_names_of_many_makers(load, rename, any_pose):
+    assert torch.equal(load([any_pose] * 2, rename=rename).qpos, load([any_pose] * 2).qpos)
+
+
+def test_other_names_are_given_by_a_map(load, any_pose):
+    strange = {"LeftLeg": "Gauche2", "Head": "Tete"}
+    joint_map = {"left_knee": "Gauche2", "neck": "Tete"}
+    found = load([any_pose] * 2, rename=lambda name: strange.get(name, name), options={"joint_map": joint_map})
+    assert torch.equal(found.qpos, load([any_pose] * 2).qpos)
+
+
+def test_a_map_wins_over_what_names_suggest(load, kinematics, any_pose, forward):
+    clip = load([any_pose] * 2, options={"joint_map": {"chest": "Spine"}})
+    _, orientations = kinematics(clip)
+    turn = (any_pose["Hips"] * any_pose["Spine"]).as_matrix()
+    np.testing.assert_allclose(orientations["chest"], forward @ turn @ forward.T, atol=1e-7)
+
+
+def test_a_body_without_arms_will_do_for_the_biped(load, skeleton):
+    legs = [joint for joint in skeleton if not re.search("Arm|Hand|Shoulder|Head|Neck", joint[0])]
+    with pytest.raises(MotionFormatError, match=r"no joint known as chest: .* its joints are Hips, Spine"):
+        load([{}] * 2, "biped", body=legs)
+    assert load([{}] * 2, "biped", body=legs, options={"joint_map": {"chest": "Chest"}}).character == "biped"
+    with pytest.raises(MotionFormatError, match="no joint known as chest, neck, right_shoulder, right_elbow"):
+        load([{}] * 2, "humanoid", body=legs)
