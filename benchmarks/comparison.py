@@ -2,6 +2,7 @@
 
     torchrl-mcp-train benchmark=table2 task=heading character=biped preset=comparison benchmark.pretrain_seed=0 seed=0,1
     python benchmarks/comparison.py runs --task heading --character biped
+    python benchmarks/comparison.py runs --task imitation --character biped --stage pretrain
 
 It writes a row for every complete run and mode to ``results/TASK_CHARACTER_methods.csv``, with what it takes to make it
 again, and the curves beside it. A page with more is written by ``torchrl-mcp-report runs``.
@@ -28,13 +29,16 @@ def main() -> None:
     parser.add_argument("runs", type=Path, help="the benchmark's run_root")
     parser.add_argument("--task", default="heading")
     parser.add_argument("--character", default="biped")
+    parser.add_argument("--stage", default="transfer", choices=["pretrain", "transfer"])
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder to write to")
     arguments = parser.parse_args()
     runs, _ = find_runs([arguments.runs])
     place = arguments.task, arguments.character
-    found = [cell for cell in cells(runs) if cell.place == place and cell.stage == "transfer" and cell.complete]
+    found = [cell for cell in cells(runs) if cell.place == place and cell.stage == arguments.stage and cell.complete]
     steps = {run.path.resolve(): run.frames for run in runs}
     rows = [row(cell, run, mode, steps) for cell in found for run in cell.complete for mode in MODES]
+    for facts in rows:
+        facts["command"] = facts["command"].replace(str(arguments.runs.resolve()), "runs")
     stem = arguments.output / f"{arguments.task}_{arguments.character}_methods"
     with stem.with_suffix(".csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
