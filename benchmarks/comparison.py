@@ -44,7 +44,7 @@ def main() -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    curves = learning_curves({method_title(cell.method): [run.path for run in cell.complete] for cell in found})
+    curves = learning_curves({title(cell): [run.path for run in cell.complete] for cell in found})
     write_curves(curves, stem.with_name(f"{stem.name}_curves.csv"))
     save_figure(draw_curves(curves), stem.with_name(f"{stem.name}_curves"))
     for cell in found:
@@ -56,9 +56,9 @@ def row(cell: Cell, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, An
     numbers, before = run.evaluation[mode], run.settings.get("pretrained")
     machine, command = run.origin.get("machine", {}), run.origin.get("command", [])
     return {
-        "method": cell.method,
+        "method": title(cell),
         "seed": run.seed,
-        "pretraining_steps": steps[Path(before).resolve()] if before else 0,
+        "pretraining_steps": steps.get(Path(before).resolve(), "") if before else 0,
         "steps": run.frames,
         "mode": mode,
         **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
@@ -80,7 +80,12 @@ def line(cell: Cell) -> str:
         numbers.append(f"{sum(cell.returns(mode)) / len(cell.complete):.3f}{spread}")
     fallen = [run.evaluation["deterministic"]["terminated"] for run in cell.complete]
     numbers.insert(1, f"{sum(fallen) / len(fallen):.0%}")
-    return f"| {method_title(cell.method)} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
+    return f"| {title(cell)} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
+
+
+def title(cell: Cell) -> str:
+    """Return the name of a method, and which pre-training it transfers from if that is the library's."""
+    return method_title(cell.method) + (", built in" if cell.choices["pretrained"] else "")
 
 
 def paper(cell: Cell) -> str:
