@@ -9,7 +9,7 @@ import torch
 from hydra import compose, initialize_config_module
 from tensordict.nn import TensorDictModule
 
-from torchrl_mcp import collection, experiment
+from torchrl_mcp import assembly, checkpoint, collection, experiment
 from torchrl_mcp.collection import RemoteCollection
 from torchrl_mcp.envs import Holdout
 from torchrl_mcp.memory import OptionMemory, TransformedCharacterEnv
@@ -42,6 +42,15 @@ def rows(folder):
 
 def numbers(row):
     return {key: value for key, value in row.items() if not key.startswith(("seconds", "time/"))}
+
+
+def restored(folder):
+    """The trainer of a run, at its newest checkpoint."""
+    cfg = experiment.configuration(folder)
+    source = assembly.make_collection(cfg)
+    trainer = assembly.make_trainer(cfg, assembly.make_agent(cfg, source.env), source, folder)
+    trainer.restore(checkpoint.find(folder))
+    return trainer
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +87,7 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
     path.write_text(path.read_text().replace("total_frames: 128", "total_frames: 384"))
     experiment.resume(tmp_path)
     resumed, whole = rows(tmp_path), rows(run)
+    assert not restored(tmp_path).episodes.lengths.any()  # of episodes that no one goes on with
     assert numbers(resumed[0]) == numbers(whole[0])
     assert [row["frames"] for row in resumed] == ["128", "256", "384"]
     assert resumed[1]["reward"] != whole[1]["reward"]

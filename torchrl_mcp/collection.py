@@ -26,10 +26,12 @@ class Collection(Protocol):
     Attributes:
         env: Environments like those that are stepped, of any number.
         num_envs: Number of environments that are stepped, ``N``.
+        resumes_episodes: Whether a resumed run goes on within its episodes, or begins new ones.
     """
 
     env: Environments
     num_envs: int
+    resumes_episodes: bool
 
     def start(
         self,
@@ -72,6 +74,8 @@ class LocalCollection:
     Args:
         env: Environments, batch size ``[N]``, with or without transforms.
     """
+
+    resumes_episodes = True
 
     def __init__(self, env: Environments) -> None:
         self.env = env
@@ -154,6 +158,8 @@ class RemoteCollection:
     Raises:
         ValueError: If the environments do not divide evenly, or Ray is not installed.
     """
+
+    resumes_episodes = False
 
     def __init__(
         self,

@@ -149,12 +149,14 @@ class Trainer:
         self.collection.stop()
 
     def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``, to the same numbers as if nothing had happened.
+        """Continue from the checkpoint file ``path``; where the collection's state is all in it, to the same numbers.
 
         Raises:
             ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
         """
         load(self.checkpoint, path)
+        if not self.collection.resumes_episodes:
+            self.episodes = EpisodeStatistics(self.collection.num_envs)
         self.record.rewind(self.progress.iteration)
 
     def save(self) -> None:
