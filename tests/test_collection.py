@@ -7,12 +7,10 @@ from importlib.util import find_spec
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from tensordict.nn import TensorDictModule
 
 from torchrl_mcp import assembly, checkpoint, collection, experiment
 from torchrl_mcp.collection import RemoteCollection
 from torchrl_mcp.envs import Holdout
-from torchrl_mcp.memory import OptionMemory, TransformedCharacterEnv
 from torchrl_mcp.progress import Stopwatch
 
 ONE_STEP = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=384"]
@@ -93,13 +91,14 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
     assert resumed[1]["reward"] != whole[1]["reward"]
 
 
-def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options():
-    policy = TensorDictModule(Restless(), in_keys=["observation"], out_keys=["action", "option", "begins"])
-    source, watch = RemoteCollection(make_remembering, num_envs=4, seed=3, num_workers=2), Stopwatch()
-    source.start(policy, frames_per_batch=20, device=torch.device("cpu"), autocast=False, stopwatch=watch)
+def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):
+    cfg = configure(tmp_path, "method=option_critic")
+    source = RemoteCollection(partial(assembly.make_env, cfg), num_envs=4, seed=3, num_workers=2)
+    policy, watch = assembly.make_agent(cfg, source.env).actor.policy, Stopwatch()
+    source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=False, stopwatch=watch)
     batch = source.collect()
     source.stop()
-    assert batch.shape == (4, 5)
+    assert batch.shape == (4, 20)
     for key in ("observation", "action"):
         assert len(batch[key][:, 0].unique(dim=0)) == 4
     assert batch["option"].unique().numel() > 2
@@ -109,25 +108,10 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
 
 def test_environments_that_do_not_divide_evenly_are_refused():
     with pytest.raises(ValueError, match="num_envs=5 must be a multiple of num_workers=2"):
-        RemoteCollection(make_env, num_envs=5, seed=0, num_workers=2)
+        RemoteCollection(Holdout, num_envs=5, seed=0, num_workers=2)
 
 
 def test_a_missing_ray_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setattr(collection, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl-mcp\[ray\]'"):
-        RemoteCollection(make_env, num_envs=4, seed=0, num_workers=2, backend="ray")
-
-
-class Restless(torch.nn.Module):
-    """An ant's actions that are noise, and another option at every step."""
-
-    def forward(self, observation):
-        shape = observation.shape[:-1]
-        return torch.randn(*shape, 8), torch.randint(100, shape), torch.ones(shape, dtype=torch.bool)
-
-
-make_env = partial(Holdout, directions=(0.0, 1.0))
-
-
-def make_remembering(**settings):
-    return TransformedCharacterEnv(make_env(**settings), OptionMemory())
+        RemoteCollection(Holdout, num_envs=4, seed=0, num_workers=2, backend="ray")
