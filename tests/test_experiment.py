@@ -77,7 +77,10 @@ def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run
         (["stage=transfer"], "pretrained=<folder>"),
         (["stage=transfer", "pretrained=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
         (["exploration=weights"], "stage=transfer"),
-        (["resume=nowhere"], "nowhere holds no run"),
+        (
+            ["resume=nowhere", "device=cuda"],
+            "leave out preset=smoke logger=none num_threads=1 progress_bar=false device=cuda",
+        ),
         (["training.minibatch_size=100"], "multiple"),
         (["num_primitives=0"], "num_primitives must be at least 1"),
     ],
@@ -124,6 +127,13 @@ def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched
     assert outcome.returncode != 0
     assert "damaged" in outcome.stderr
     assert contents(copy) == before
+
+
+def test_a_resume_of_no_run_says_what_is_missing(tmp_path):
+    outcome = command("train", "resume=nowhere", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "nowhere holds no run" in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_complete_run_is_left_as_it_is_and_said_to_be_complete(run, monkeypatch, capsys):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -77,6 +78,9 @@ def suggestions(arguments: list[str]) -> list[str]:
 
 
 def _resume(folder: Path) -> Path:
+    given = HydraConfig.get().overrides.task
+    if ignored := [setting for setting in given if not setting.startswith("resume=")]:
+        raise ValueError(f"a run goes on with the settings that it began with: leave out {' '.join(ignored)}")
     if experiment.is_complete(folder):
         print(f"{folder} is complete: nothing is left to do")
     return experiment.resume(folder)
