@@ -5,12 +5,14 @@
     python benchmarks/comparison.py runs --task imitation --character biped --stage pretrain
 
 It writes a row for every complete run and mode to ``results/TASK_CHARACTER_methods.csv``, with what it takes to make it
-again, and the curves beside it. A page with more is written by ``torchrl-mcp-report runs``.
+again, and beside it the curves of those pre-trained for as long as most. A page with more is written by
+``torchrl-mcp-report runs``.
 """
 
 import argparse
 import csv
 import shlex
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +37,15 @@ def main() -> None:
     runs, _ = find_runs([arguments.runs])
     place = arguments.task, arguments.character
     found = [cell for cell in cells(runs) if cell.place == place and cell.stage == arguments.stage and cell.complete]
+    usual = Counter(map(budget, found)).most_common(1)[0][0]
+    titles = [title(cell, usual) for cell in found]
     steps = {run.path.resolve(): run.frames for run in runs}
-    rows = [row(cell, run, mode, steps) for cell in found for run in cell.complete for mode in MODES]
+    rows = [
+        row(cell, name, run, mode, steps)
+        for cell, name in zip(found, titles, strict=True)
+        for run in cell.complete
+        for mode in MODES
+    ]
     for facts in rows:
         facts["command"] = facts["command"].replace(str(arguments.runs.resolve()), "runs")
     stem = arguments.output / f"{arguments.task}_{arguments.character}_methods"
@@ -44,19 +53,20 @@ def main() -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    curves = learning_curves({title(cell): [run.path for run in cell.complete] for cell in found})
+    drawn = [cell for cell in found if budget(cell) == usual]
+    curves = learning_curves({title(cell, usual): [run.path for run in cell.complete] for cell in drawn})
     write_curves(curves, stem.with_name(f"{stem.name}_curves.csv"))
     save_figure(draw_curves(curves), stem.with_name(f"{stem.name}_curves"))
-    for cell in found:
-        print(line(cell))
+    for cell, name in zip(found, titles, strict=True):
+        print(line(cell, name))
 
 
-def row(cell: Cell, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
+def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
     """Return the facts of a run and its numbers in a mode."""
     numbers, before = run.evaluation[mode], run.settings.get("pretrained")
     machine, command = run.origin.get("machine", {}), run.origin.get("command", [])
     return {
-        "method": title(cell),
+        "method": name,
         "seed": run.seed,
         "pretraining_steps": steps.get(Path(before).resolve(), "") if before else 0,
         "steps": run.frames,
@@ -72,7 +82,7 @@ def row(cell: Cell, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, An
     }
 
 
-def line(cell: Cell) -> str:
+def line(cell: Cell, name: str) -> str:
     """Return a row of a table in Markdown."""
     numbers = []
     for mode in MODES:
@@ -80,12 +90,20 @@ def line(cell: Cell) -> str:
         numbers.append(f"{sum(cell.returns(mode)) / len(cell.complete):.3f}{spread}")
     fallen = [run.evaluation["deterministic"]["terminated"] for run in cell.complete]
     numbers.insert(1, f"{sum(fallen) / len(fallen):.0%}")
-    return f"| {title(cell)} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
+    return f"| {name} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
 
 
-def title(cell: Cell) -> str:
-    """Return the name of a method, and which pre-training it transfers from if that is the library's."""
-    return method_title(cell.method) + (", built in" if cell.choices["pretrained"] else "")
+def title(cell: Cell, usual: int | None) -> str:
+    """Return the name of a method, and what it transfers from if that is not the usual pre-training."""
+    if cell.choices["pretrained"]:
+        return f"{method_title(cell.method)}, built in"
+    steps = budget(cell)
+    return method_title(cell.method) + (f", {steps / 1e6:g} M" if steps and steps != usual else "")
+
+
+def budget(cell: Cell) -> int | None:
+    """Return for how many steps the methods are pre-trained, if the preset says so."""
+    return cell.complete[0].settings.get("budget.pretrain")
 
 
 def paper(cell: Cell) -> str:
