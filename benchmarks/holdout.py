@@ -12,6 +12,7 @@ import csv
 import math
 import os
 import platform
+import shlex
 import statistics
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from torchrl_mcp import experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
+from torchrl_mcp.analysis.results import Run, read_run
 from torchrl_mcp.run_folder import CONFIG
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -155,18 +157,30 @@ def trajectories(run: Path, stage: str) -> Trajectories:
 
 
 def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
-    """Return the numbers of a run, deterministic and stochastic."""
-    contender, run = CONTENDERS[name], folder / f"{name}-{seed}"
-    numbers = experiment.evaluate_run(run, episodes=episodes, seed=12345)
+    """Return the numbers of a run, deterministic and stochastic, with what it takes to make it again."""
+    contender, path = CONTENDERS[name], folder / f"{name}-{seed}"
+    run = read_run(path)
+    if not isinstance(run, Run):
+        raise ValueError(f"{path} {run.reason}")
+    numbers = experiment.evaluate_run(path, episodes=episodes, seed=12345)
     for values in numbers.values():
         del values["measures"], values["diagnostics"]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    facts = {"contender": name, "label": contender.label, "seed": seed, "frames": contender.steps, "preset": "fast"}
-    machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
-    return [
-        facts | {"mode": mode, "paper": contender.paper} | values | machine
-        for mode, values in numbers.items()
-    ]  # fmt: skip
+    facts = {
+        "contender": name,
+        "label": contender.label,
+        "seed": seed,
+        "pretraining_steps": PRETRAINING if contender.pretraining else 0,
+        "frames": contender.steps,
+        "preset": "fast",
+    }
+    source = {
+        "seconds": round(run.seconds),
+        "commit": run.commit,
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        "command": shlex.join(run.origin.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
+    }
+    return [facts | {"mode": mode, "paper": contender.paper} | values | source for mode, values in numbers.items()]
 
 
 def table(rows: list[dict]) -> str:
