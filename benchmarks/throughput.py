@@ -14,13 +14,9 @@ interpreter that has it.
 """
 
 import argparse
-import csv
-import importlib.metadata
-import importlib.util
 import json
 import math
 import os
-import platform
 import subprocess
 import sys
 import time
@@ -33,6 +29,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from report import about, write
 
 RESULTS = Path(__file__).parent / "results" / "throughput_env.csv"
 SUBSTEPS = 5
@@ -212,23 +209,6 @@ def answer(process: subprocess.Popen, line: str = "") -> dict[str, Any]:
     return next((json.loads(line) for line in process.stdout if line.startswith("{")), {})
 
 
-def hardware() -> dict[str, str]:
-    """What the numbers were measured on and with."""
-    cpu = platform.processor()
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent)
-    packages = ["torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy"]
-    return {
-        "cpu": cpu,
-        "cpus": str(os.cpu_count()),
-        "python": platform.python_version(),
-        **{package: importlib.metadata.version(package) for package in packages},
-        "commit": commit.stdout.strip(),
-    }
-
-
 def ratio(row: dict[str, Any], other: dict[str, Any]) -> float:
     """Median over rounds of the ratio of two contenders' speeds."""
     return median(a / b for a, b in zip(row["speeds"], other["speeds"], strict=True))
@@ -246,22 +226,17 @@ def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
                 yield f"torchrl-mcp at {size}: {times:.3f} times {name} at {turn[name]['num_envs']} (aim {aim})"
 
 
-def write(path: Path, rows: list[dict[str, Any]], about: dict[str, str]) -> None:
-    """Write a line per contender and size."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fields = ["turn", "contender", "num_envs", "steps_per_second", "best", "of_limit", "memory_mib", "rounds"]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*fields, *about])
-        writer.writeheader()
-        for row in rows:
-            numbers = {
-                "steps_per_second": round(median(row["speeds"])),
-                "best": round(max(row["speeds"])),
-                "of_limit": f"{row['of_limit']:.3f}",
-                "memory_mib": round(row["memory"]),
-                "rounds": len(row["speeds"]),
-            }
-            writer.writerow({**{key: row[key] for key in fields[:3]}, **numbers, **about})
+def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the line of a table for what a contender did."""
+    return {
+        **{key: row[key] for key in ("turn", "contender", "num_envs")},
+        "steps_per_second": round(median(row["speeds"])),
+        "best": round(max(row["speeds"])),
+        "of_limit": f"{row['of_limit']:.3f}",
+        "memory_mib": round(row["memory"]),
+        "rounds": len(row["speeds"]),
+        **facts,
+    }
 
 
 def main() -> None:
@@ -276,8 +251,8 @@ def main() -> None:
         worker(args.worker[0], int(args.worker[1]))
 
     rounds, seconds = (3, 0.7) if args.quick else (5, 1.0)
-    about, rows = hardware(), []
-    print(" | ".join(f"{key} {value}" for key, value in about.items()))
+    facts, rows = about(), []
+    print(" | ".join(f"{key} {value}" for key, value in facts.items()))
     print(f"{'contender':28} {'envs':>5} {'steps/s':>9} {'best':>9} {'of limit':>9} {'memory MiB':>11}")
     for turn in (1, 2) if args.quick else range(len(SIZES)):
         sizes = {name: counts[turn] for name, (_, counts) in CONTENDERS.items()}
@@ -292,7 +267,7 @@ def main() -> None:
             )
         rows += new
     print("\n".join(aims(rows)))
-    write(args.output, rows, about)
+    write(args.output, [line(row, facts) for row in rows])
 
 
 if __name__ == "__main__":
