@@ -130,6 +130,18 @@ def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 4_000_000)
 
 
+def test_a_longer_transfer_shares_the_pretraining_of_a_shorter_one(tmp_path):
+    def jobs(*budget):
+        arguments = ["task=dribble", "character=biped", "method=mcp", "preset=comparison", "seed=0", *budget]
+        return jobs_of("benchmark=table2", f"run_root={tmp_path}", *arguments)
+
+    source, shorter = jobs()
+    same, longer = jobs("budget.transfer=2000000", "budget.scratch=5000000")
+    assert (same.folder, same.config) == (source.folder, source.config)
+    assert longer.folder != shorter.folder
+    assert (longer.needs, longer.config["training"]["total_frames"]) == (source.folder, 2_000_000)
+
+
 @pytest.mark.parametrize(
     ("benchmark", "key", "pretrainings", "values"),
     [

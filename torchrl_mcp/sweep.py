@@ -33,7 +33,7 @@ from torchrl_mcp.run_folder import CONFIG, LOG
 from torchrl_mcp.sweep_status import MANIFEST, overview, write_manifest
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
-TRANSFER_ONLY = {"exploration", "pretrained", "transfer.freeze", "transfer.keep"}
+TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "pretrained", "transfer.freeze", "transfer.keep"}
 """Settings that make no difference to pre-training, or that it refuses."""
 INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
                "progress_bar", "resume", "torch_threads"}  # fmt: skip
