@@ -37,6 +37,8 @@ def main() -> None:
     runs, _ = find_runs([arguments.runs])
     place = arguments.task, arguments.character
     found = [cell for cell in cells(runs) if cell.place == place and cell.stage == arguments.stage and cell.complete]
+    if not found:
+        parser.error(f"{arguments.runs} holds no complete run of {' '.join(place)}, {arguments.stage}")
     usual = Counter(map(budget, found)).most_common(1)[0][0]
     titles = [title(cell, usual) for cell in found]
     steps = {run.path.resolve(): run.frames for run in runs}
@@ -72,6 +74,7 @@ def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> d
         "steps": run.frames,
         "mode": mode,
         **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
+        **{key: value for key, value in numbers["measures"].items() if not key.startswith("reward_")},
         "episodes": numbers["episodes"],
         "paper": paper(cell),
         "seconds": round(run.seconds),
