@@ -67,6 +67,14 @@ def test_a_curve_ends_with_its_shortest_seed_on_a_grid_common_to_all(tmp_path):
     np.testing.assert_allclose(both.mean, 1.5)
 
 
+@pytest.mark.parametrize(("extra", "ends"), [(1, 250), (4, 250), (6, 350)])
+def test_a_bin_of_which_a_run_covers_less_than_half_is_left_out(tmp_path, extra, ends):
+    short = write_run(tmp_path / "short", [(10 * i, 1, 1.0) for i in range(1, 30 + extra + 1)])
+    long = constant_run(tmp_path / "long", 2.0)
+    curve, _ = learning_curves({"short": [short], "long": [long]}, num_bins=10)
+    assert curve.frames[-1] == ends
+
+
 def test_a_row_half_written_is_left_out(tmp_path):
     run = constant_run(tmp_path / "run", 1.0, num_rows=2)
     with (run / "metrics.csv").open("a") as file:

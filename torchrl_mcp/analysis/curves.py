@@ -63,8 +63,8 @@ def learning_curves(
 
     Steps are divided into ``num_bins`` equal bins up to the last value of the longest run. A bin holds the mean of a
     run's rows, weighted by ``episode/count`` where the quantity is a mean over episodes. Bins in which no episode ended
-    are interpolated. A bin should be no shorter than an episode of all environments together: in a shorter one the
-    episodes that failed early can be among themselves.
+    are interpolated, and a run's last is left out if it covers less than half of it. A bin should be no shorter than an
+    episode of all environments together: in a shorter one the episodes that failed early can be among themselves.
 
     Args:
         groups: Run folders, one per seed, by the label of their curve.
@@ -154,11 +154,14 @@ def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
 
 
 def _binned(frames: Array, values: Array, weights: Array, edges: Array) -> Array:
-    """Weighted means in the bins ``(edges[i], edges[i + 1]]``; NaN before the first and after the last point."""
+    """Weighted means in the bins ``(edges[i], edges[i + 1]]``; NaN before the first point and after the last."""
     index = np.searchsorted(edges, frames, side="left").clip(1, len(edges) - 1) - 1
     total, mass = (np.bincount(index, x, minlength=len(edges) - 1) for x in (weights * values, weights))
     bins = np.arange(len(edges) - 1)
     full = mass > 0
+    last = index.max()  # of which less than half says little
+    if full[:last].any() and frames.max() < (edges[last] + edges[last + 1]) / 2:
+        full[last] = False
     return np.interp(bins, bins[full], total[full] / mass[full], left=np.nan, right=np.nan)
 
 
