@@ -58,7 +58,7 @@ def train(collector: str, seed: int, steps: int) -> tuple[float, float]:
         settings = [*COMMON, *QUIET, *COLLECTORS[collector], f"collector={collector}", f"seed={seed}"]
         arguments = [*settings, f"training.total_frames={steps}", f"run_dir={folder}/run"]
         environment = {**os.environ, "OMP_NUM_THREADS": str(CORES), "RAY_USAGE_STATS_ENABLED": "0"}
-        subprocess.run([sys.executable, "-m", "torchrl_mcp.train", *arguments], check=True, env=environment)
+        subprocess.run([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], check=True, env=environment)
         rows = list(read_metrics(Path(folder) / "run"))
     ended = [row for row in rows[-len(rows) // 4 :] if row["episode/count"]]
     late = [row["episode/normalised_return"] for row in ended]

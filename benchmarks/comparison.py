@@ -16,11 +16,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.analysis.comparison import Cell, cells
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.analysis.results import MODES, Run, find_runs
-from torchrl_mcp.analysis.sections import method_title
+from torchrl_mcp.report.comparison import Cell, cells
+from torchrl_mcp.report.results import MODES, Run, find_runs
+from torchrl_mcp.report.sections import method_title
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

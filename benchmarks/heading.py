@@ -21,11 +21,11 @@ from pathlib import Path
 
 import torch
 
-from torchrl_mcp import experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.analysis.films import save_film
-from torchrl_mcp.run_folder import CONFIG
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.viewer.film import save_film
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CHARACTERS = {"biped": 4_000_000, "humanoid": 3_000_000, "trex": 1_000_000}
@@ -60,7 +60,7 @@ def train(run: Path, character: str) -> None:
     ]
     begun = (run / CONFIG).exists()
     arguments = [f"resume={run}"] if begun else [*COMMON, *settings, f"run_dir={run}"]
-    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+    command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]
     subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 

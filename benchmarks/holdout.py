@@ -22,12 +22,12 @@ from pathlib import Path
 
 import torch
 
-from torchrl_mcp import experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
-from torchrl_mcp.analysis.results import Run, read_run
-from torchrl_mcp.run_folder import CONFIG
+from torchrl_mcp.report.results import Run, read_run
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.training.run_folder import CONFIG
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PRETRAINING, TRANSFER = 1_000_000, 600_000
@@ -121,7 +121,7 @@ def learn(folder: Path, name: str, seed: int) -> None:
 def train(run: Path, settings: list[str]) -> None:
     """Train in a process of its own, or go on where a former one stopped."""
     arguments = [f"resume={run}"] if (run / CONFIG).exists() else [*COMMON, *settings, f"run_dir={run}"]
-    command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+    command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]
     subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 

@@ -19,12 +19,13 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from torchrl_mcp import checkpoint, experiment
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.analysis.films import save_film
-from torchrl_mcp.builtin import FOLDER
-from torchrl_mcp.run_folder import CONFIG
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs.builtin import FOLDER
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.viewer.film import save_film
 
 RESULTS = Path(__file__).resolve().parent / "results"
 ANY, LOST, CHANGING = {"switch_candidates": 1}, {"failure_weighting": 0.5}, {"switch_interval": 1.5}
@@ -84,7 +85,7 @@ def train(run: Path, character: str) -> None:
             phase = [f"imitation.{name}={value}" for name, value in settings.items()]
             facts = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
             arguments = [*COMMON, *MACHINE, *facts, *phase]
-        command = [sys.executable, "-m", "torchrl_mcp.train", *arguments]
+        command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 

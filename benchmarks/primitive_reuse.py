@@ -27,9 +27,9 @@ from report import about, table, write
 from tensordict import TensorDict, TensorDictBase
 from training_throughput import configuration
 
-from torchrl_mcp import assembly
-from torchrl_mcp.collection import LocalCollection
-from torchrl_mcp.training import Trainer
+from torchrl_mcp.runs import build
+from torchrl_mcp.training.collectors import LocalSource
+from torchrl_mcp.training.trainer import Trainer
 
 RESULTS = Path(__file__).resolve().parent / "results" / "primitive_reuse.csv"
 QUICK_TRAINING = {"num_envs": 16, "frames_per_batch": 256, "minibatch_size": 128, "num_epochs": 2}
@@ -56,16 +56,16 @@ def make_trainer(cfg: DictConfig, sizes: Sizes, folder: Path, *, reuse: bool) ->
         action_spec=torch.empty(num_envs, sizes.action),
     )
     torch.manual_seed(cfg.seed)
-    agent = assembly.make_agent(cfg, env)
+    agent = build.make_agent(cfg, env)
     if not reuse:
         agent = replace(agent, actor=instantiate(cfg.actor)(agent.parts))
-    return assembly.make_trainer(cfg, agent, LocalCollection(env), folder)
+    return build.make_trainer(cfg, agent, LocalSource(env), folder)
 
 
 @torch.no_grad()
 def collect(trainer: Trainer, sizes: Sizes) -> TensorDictBase:
-    """Return a batch ``(N, T)`` as collection and estimation of advantages leave it, of random states."""
-    num_envs = trainer.collection.num_envs
+    """Return a batch ``(N, T)`` as source and estimation of advantages leave it, of random states."""
+    num_envs = trainer.source.num_envs
     steps = []
     for _ in range(trainer.frames_per_batch // num_envs):
         state = {"observation": torch.randn(num_envs, sizes.observation), "goal": torch.randn(num_envs, sizes.goal)}

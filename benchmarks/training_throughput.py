@@ -73,7 +73,7 @@ class Turns:
 
 def ours(method: str, precision: str, training: dict[str, int]) -> None:
     """Train by the library's own configuration and loop."""
-    from torchrl_mcp import assembly
+    from torchrl_mcp.runs import build
 
     settings = {
         "method": method,
@@ -92,10 +92,10 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         **{f"training.{key}": value for key, value in training.items()},
     }
     cfg = configuration(*(f"{key}={value}" for key, value in settings.items()))
-    collection = assembly.make_collection(cfg)
-    trainer = assembly.make_trainer(cfg, assembly.make_agent(cfg, collection.env), collection, Path(cfg.run_dir))
+    source = build.make_source(cfg)
+    trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, Path(cfg.run_dir))
     turns = Turns()
-    trainer.record.loggers = [turns]
+    trainer.metrics_writer.loggers = [turns]
     turns.begin()
     trainer.run()
 

@@ -10,11 +10,11 @@ from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.carry import Carry
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.dribble import Dribble
+from torchrl_mcp.envs.gymnasium_env import register
 from torchrl_mcp.envs.heading import Heading
 from torchrl_mcp.envs.holdout import Holdout
 from torchrl_mcp.envs.imitation import Imitation
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.single import register
 
 __all__ = ["Carry", "CharacterEnv", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
 

@@ -26,7 +26,7 @@ class CharacterEnv(EnvBase):
     beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
 
     A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward
-    0 and the observation from before the step, and ``num_faults`` counts it.
+    0 and the observation from before the step, and ``num_diverged`` counts it.
 
     Args:
         model: Character and scene.
@@ -93,7 +93,7 @@ class CharacterEnv(EnvBase):
         )
         episode = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
         self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()}
-        self.num_faults = 0
+        self.num_diverged = 0
         self._snapshot: TensorDict | None = None
         self._observed: dict[str, Tensor] = {}
         self.generator = torch.Generator()
@@ -117,13 +117,17 @@ class CharacterEnv(EnvBase):
 
     def get_extra_state(self) -> dict[str, Any]:
         """All that training needs to continue: the snapshot, the generator and the count of faults (``state_dict``)."""
-        return {"snapshot": dict(self.get_state()), "generator": self.generator.get_state(), "faults": self.num_faults}
+        return {
+            "snapshot": dict(self.get_state()),
+            "generator": self.generator.get_state(),
+            "faults": self.num_diverged,
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
         self._snapshot = TensorDict(state["snapshot"], self.batch_size)
         self.generator.set_state(state["generator"].cpu())
-        self.num_faults = state["faults"]
+        self.num_diverged = state["faults"]
 
     def render(self, index: int = 0, *, width: int = 480, height: int = 480, distance: float = 4.0) -> Tensor:
         """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
@@ -174,11 +178,11 @@ class CharacterEnv(EnvBase):
             )
         faults = self.simulation.step(self._controls(action))
         self.episode["elapsed_steps"] += 1
-        reward, terminated = self._judge(faults)
+        reward, terminated = self._reward_and_termination(faults)
         if len(faults):
             reward[faults], terminated[faults] = 0.0, True
-            self.num_faults += len(faults)
-        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._exhausted()
+            self.num_diverged += len(faults)
+        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._truncation()
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
@@ -233,7 +237,7 @@ class CharacterEnv(EnvBase):
         """What the actuators are given, ``(N, A)``: the action as it is."""
         return action
 
-    def _exhausted(self) -> Tensor:
+    def _truncation(self) -> Tensor:
         """Whether the task cannot go on, through no fault of the character: truncates the episode, ``(N, 1)``."""
         return torch.zeros(self.num_envs, 1, dtype=torch.bool)
 
@@ -257,7 +261,7 @@ class CharacterEnv(EnvBase):
         """
 
     @abstractmethod
-    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
 
         Args:
@@ -265,7 +269,7 @@ class CharacterEnv(EnvBase):
         """
 
     @property
-    def measure_names(self) -> dict[str, list[str]]:
+    def metric_names(self) -> dict[str, list[str]]:
         """What is observed for the record, not for the policy: the names of the entries of each key."""
         return {key: [key] for key in self._observed if key not in ("observation", "goal")}
 

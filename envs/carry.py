@@ -111,8 +111,8 @@ class Carry(Transport):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "taken": torch.zeros(len(ids))}
 
-    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
-        judged = super()._judge(faults)
+    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+        judged = super()._reward_and_termination(faults)
         touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
         closing, opening = self._standing(touching, "source"), self._standing(self._joined == 1, "target")
         if len(closing):

@@ -158,7 +158,7 @@ class Holdout(CharacterEnv):
             parts.append(self.episode["contact_forces"][ids, 1:].flatten(1))  # Ant-v5 leaves the world body out
         return {"observation": torch.cat(parts, -1), "goal": self.episode["goal"][ids]}
 
-    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         velocity = (self._torso - self.episode["position"]) / self.control_timestep
         self.episode["position"].copy_(self._torso)
         healthy = self._height == self._height.clamp(*self.healthy_z_range)

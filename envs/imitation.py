@@ -6,9 +6,10 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.adaptive_sampler import AdaptiveSampler
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.difficulty import Difficulty
+from torchrl_mcp.envs.imitation_reward import Term, imitation_rewards, mismatch, squared_angles, squared_distances
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import joint_layout
 from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
@@ -16,7 +17,6 @@ from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
-from torchrl_mcp.envs.tracking import Term, mismatch, squared_angles, squared_distances, tracking_rewards
 
 NUM_TARGETS = 2
 """States of the reference that the goal shows ahead (section 4)."""
@@ -40,13 +40,13 @@ class Imitation(PDCharacterEnv):
     An episode begins at a random moment of a random clip, in the reference's own state. With probability
     :math:`\Delta t /` ``switch_interval`` per step the reference becomes another random moment, brought to where the
     character is and faces: of ``switch_candidates`` moments the one whose bodies are most like the character's, by
-    :func:`~torchrl_mcp.envs.tracking.mismatch`. ``goal`` (2 x 13 L) holds, for the next two steps, the positions of
-    the L bodies of the reference relative to the ground below the character, their orientations and velocities, in its
-    heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in
-    metres, and ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
+    :func:`~torchrl_mcp.envs.imitation_reward.mismatch`. ``goal`` (2 x 13 L) holds, for the next two steps, the
+    positions of the L bodies of the reference relative to the ground below the character, their orientations and
+    velocities, in its heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the reference after
+    the step, in metres, and ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
 
-    The reward is the sum of :func:`~torchrl_mcp.envs.tracking.tracking_rewards` of these errors: ``pose``, the mean
-    squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
+    The reward is the sum of :func:`~torchrl_mcp.envs.imitation_reward.imitation_rewards` of these errors: ``pose``, the
+    mean squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
     ``root_velocity``, the squared distance plus a tenth of the squared angle of the root; ``key_positions``, the mean
     squared distance of the character's key bodies relative to the root; ``bodies``, the mean squared distance of all
     bodies in the world; ``orientations``, the mean squared angle of all bodies in the world; ``com``, the squared
@@ -57,7 +57,7 @@ class Imitation(PDCharacterEnv):
     does, and the value of what would follow counts.
 
     With probability ``failure_weighting`` a moment is drawn where episodes end often, see
-    :class:`~torchrl_mcp.envs.difficulty.Difficulty`, and else evenly.
+    :class:`~torchrl_mcp.envs.adaptive_sampler.AdaptiveSampler`, and else evenly.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -121,7 +121,7 @@ class Imitation(PDCharacterEnv):
         self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
-        self._difficulty = Difficulty(library)
+        self._sampler = AdaptiveSampler(library)
         self._layout, names = joint_layout(character), library.body_names
         self._keys = [names.index(body) for body in CHARACTERS[character].key_bodies]
         reference = {
@@ -142,9 +142,9 @@ class Imitation(PDCharacterEnv):
         return episode_return / (self.max_episode_steps * sum(term.weight for term in self.terms.values()))
 
     @property
-    def measure_names(self) -> dict[str, list[str]]:
-        """See :attr:`CharacterEnv.measure_names`."""
-        return {**super().measure_names, "reward_terms": [f"reward_{name}" for name in self.terms]}
+    def metric_names(self) -> dict[str, list[str]]:
+        """See :attr:`CharacterEnv.metric_names`."""
+        return {**super().metric_names, "reward_terms": [f"reward_{name}" for name in self.terms]}
 
     def beginning(self, clips: Tensor, times: Tensor) -> dict[str, Tensor]:
         """States for ``reset(set_state=True)`` that begin episodes at moments of clips, each ``(n, ...)``.
@@ -168,7 +168,7 @@ class Imitation(PDCharacterEnv):
 
     def get_extra_state(self) -> dict[str, Any]:
         """See :meth:`CharacterEnv.get_extra_state`; and what motions there are, and where references are lost."""
-        own = {"motions": self.library.digest, "difficulty": self._difficulty.state_dict()}
+        own = {"motions": self.library.digest, "difficulty": self._sampler.state_dict()}
         return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -183,7 +183,7 @@ class Imitation(PDCharacterEnv):
                 "begin another from it with stage=pretrain pretrained=<folder>"
             )
         super().set_extra_state(state)
-        self._difficulty.load_state_dict(state["difficulty"])
+        self._sampler.load_state_dict(state["difficulty"])
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
@@ -196,7 +196,7 @@ class Imitation(PDCharacterEnv):
         if not self.failure_weighting:
             return clips, times
         hard = torch.rand(num, generator=self.generator) < self.failure_weighting
-        others = self._difficulty.draw(num, self.generator)
+        others = self._sampler.draw(num, self.generator)
         return torch.where(hard, others[0], clips), torch.where(hard, others[1], times)
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
@@ -227,16 +227,16 @@ class Imitation(PDCharacterEnv):
         self._next = first if isinstance(ids, slice) else self._next.replaced(ids, first)
         return targets
 
-    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         self.episode["time"] += CONTROL_TIMESTEP
         reference = self._next
         error = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1).mean(-1)
         lost = self.episode["error"].copy_(error) > self.max_error
-        rewards = tracking_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
+        rewards = imitation_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
         reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
         ended = fallen | lost
         if self.failure_weighting:
-            self._difficulty.count(self.episode["clip"], self.episode["time"], ended)
+            self._sampler.count(self.episode["clip"], self.episode["time"], ended)
         self._switch()
         return reward.masked_fill(lost, 0.0), ended
 
@@ -294,7 +294,7 @@ class Imitation(PDCharacterEnv):
         places = reference.positions + rotate(reference.orientations, centres)
         return masses @ places / masses.sum()
 
-    def _exhausted(self) -> Tensor:
+    def _truncation(self) -> Tensor:
         return (self._ended() & (self.clip_end == "truncate")).unsqueeze(-1)
 
     def _ended(self) -> Tensor:

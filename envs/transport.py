@@ -146,7 +146,7 @@ class Transport(PDCharacterEnv):
         things = (part[ids].to(self._dtype) for part in self._things)
         return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(ids), things, strict=True)))
 
-    def _judge(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
         self.episode["object"].copy_(self._object)
         reward = self._reward(

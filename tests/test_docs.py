@@ -15,8 +15,8 @@ from hydra import compose, initialize_config_module
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp import assembly
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.runs import build
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -93,8 +93,8 @@ def test_the_code_of_a_tutorial_runs_from_top_to_bottom_and_its_commands_find_it
 
     for arguments in filter(of_own_files, COMMAND.findall(text)):
         cfg = composed(arguments)
-        env = assembly.make_env(cfg, num_envs=2, seed=0)
-        policy = assembly.make_agent(cfg, env).actor.policy
+        env = build.make_env(cfg, num_envs=2, seed=0)
+        policy = build.make_agent(cfg, env).actor.policy
         with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
             assert env.rollout(2, policy)["next", "reward"].isfinite().all()
 

@@ -6,8 +6,9 @@ import shutil
 import pytest
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp import assembly, checkpoint, experiment
-from torchrl_mcp.transfer import fingerprint
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.transfer import fingerprint
 
 ANT = (["task=holdout"], ["task=holdout"])
 BIPED = (["task=imitation", "motions=single", "character=biped"], ["task=heading", "character=biped"])
@@ -67,7 +68,7 @@ def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_fre
     cfg, agent, env = experiment.restore(transferred, num_envs=1, seed=0)
     after = {name: fingerprint(part) for name, part in agent.parts.items()}
     file = checkpoint.find(pretrained) if pretrained else None
-    start = {name: fingerprint(part) for name, part in assembly.make_agent(cfg, env, file).parts.items()}
+    start = {name: fingerprint(part) for name, part in build.make_agent(cfg, env, file).parts.items()}
     if pretrained:
         before = fingerprints(pretrained)
         assert {name for name in start if start[name] == before.get(name)} == set(cfg.transfer.keep)

@@ -2,7 +2,7 @@
 
 from torchrl_mcp.envs.motions.clip import MotionClip, concatenated
 from torchrl_mcp.envs.motions.corpus import generated_library
-from torchrl_mcp.envs.motions.gait_corpus import turning_clips, walking_corpus
+from torchrl_mcp.envs.motions.gait.corpus import turning_clips, walking_corpus
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.trex import trex_corpus
 

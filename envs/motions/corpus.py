@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.gait_corpus import walking_corpus
+from torchrl_mcp.envs.motions.gait.corpus import walking_corpus
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.trex import trex_corpus
 

@@ -16,8 +16,8 @@ from torchrl_mcp.analysis.walks import (
     specialisation,
     swings,
 )
-from torchrl_mcp.clips import single_motion
 from torchrl_mcp.envs import Imitation
+from torchrl_mcp.envs.motions.single import single_motion
 
 PERIOD, STEPS = 30, 150
 

@@ -142,7 +142,7 @@ def test_a_diverging_simulation_ends_its_own_episode_only(contact_forces):
     assert not first["next", "truncated"].any()
     assert first["next", "reward"][0, 2] == 0
     assert torch.equal(first["next", "observation"][0, 2], before[2])
-    assert env.num_faults == 1
+    assert env.num_diverged == 1
     assert_identical(first[:, [0, 1, 3]], expected[:, [0, 1, 3]])
 
 
@@ -152,7 +152,7 @@ def test_faults_never_emit_a_number_that_is_not_finite(contact_forces):
     script = actions(30)
     script[3, 0, 2], script[10, 1, 7], script[11:20, 2] = float("nan"), float("inf"), 1e20
     steps, _ = play(env, env.reset(), script)
-    assert env.num_faults == 1 + 1 + 9
+    assert env.num_diverged == 1 + 1 + 9
     for key in ("observation", "goal", "reward"):
         assert steps["next", key].isfinite().all(), key
     assert steps["next", "terminated"][11:20, 2].all()

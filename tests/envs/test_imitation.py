@@ -218,7 +218,7 @@ def test_where_references_are_lost_they_come_back_more_often():
     env = make(num_envs=3000, clips=clips, failure_weighting=0.6)
     env.reset()
     assert (env.episode["clip"] == 0).double().mean().item() == pytest.approx(2 / 5, abs=0.04)
-    difficulty = env._difficulty
+    difficulty = env._sampler
     for step in range(2000):  # seconds 0 and 1 of the first, 0 to 2 of the second, whose last is lost every fifth time
         clip, time = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0.5, 7.5, 0.5, 1.5, 2.5]).double()
         difficulty.count(clip, time, torch.tensor([False, False, False, False, step % 5 == 0]))
@@ -235,17 +235,17 @@ def test_failures_are_counted_by_the_second_and_survive_a_checkpoint():
     state["clip"], state["time"] = torch.tensor([0, 1, 1, 1]), torch.tensor([0.2, 0.2, 1.2, 3.2]).double()
     state["qpos"][:, 1] += 10.0  # all are lost
     idle(env, env.reset(state, set_state=True))
-    failures = env._difficulty.failures
+    failures = env._sampler.failures
     torch.testing.assert_close(failures, torch.tensor([2.0, 1.0, 2.0, 3.0]).double(), atol=1e-2, rtol=0)
     copy.load_state_dict(env.state_dict())
-    assert torch.equal(copy._difficulty.failures, failures)
-    assert torch.equal(copy._difficulty.steps, env._difficulty.steps)
+    assert torch.equal(copy._sampler.failures, failures)
+    assert torch.equal(copy._sampler.steps, env._sampler.steps)
 
 
 def test_the_terms_of_the_reward_are_told():
     env = make(num_envs=2)
     outcome = idle(env, env.reset())
-    assert env.measure_names["reward_terms"] == ["reward_pose", "reward_root_pose"]
+    assert env.metric_names["reward_terms"] == ["reward_pose", "reward_root_pose"]
     torch.testing.assert_close(outcome["reward_terms"].sum(-1, keepdim=True), outcome["reward"])
 
 

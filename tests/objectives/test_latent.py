@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal, kl_divergence
 
-from torchrl_mcp.critics import value_critic
-from torchrl_mcp.latent import NOISE, latent_actor, latent_parts
+from torchrl_mcp.methods.critic import value_critic
+from torchrl_mcp.methods.latent_space import NOISE, latent_actor, latent_parts
 from torchrl_mcp.modules import GaussianPolicy, StateGoalEncoder
 from torchrl_mcp.objectives import BoundedClipPPOLoss, LatentPPOLoss
 from torchrl_mcp.objectives.latent import standard_normal_kl

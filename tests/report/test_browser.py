@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 
 import pytest
 
-from torchrl_mcp.analysis.results import find_runs
-from torchrl_mcp.report import report
+from torchrl_mcp.cli.report import report
+from torchrl_mcp.report.results import find_runs
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 CHROMIUM = next(filter(None, map(shutil.which, ["chromium", "chromium-browser", "google-chrome"])), None)

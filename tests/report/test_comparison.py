@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from torchrl_mcp.analysis.comparison import ablations, caveats, cells, over_tasks
-from torchrl_mcp.analysis.results import read_run
+from torchrl_mcp.report.comparison import ablations, caveats, cells, over_tasks
+from torchrl_mcp.report.results import read_run
 
 
 def grouped(*folders):

@@ -1,6 +1,6 @@
 import re
 
-from torchrl_mcp.analysis.paper import METHODS, PLACES, TABLE_2
+from torchrl_mcp.report.paper import METHODS, PLACES, TABLE_2
 
 PRINTED = """
 Heading: Biped	0.927±0.032	0.970±0.002	0.834±0.001	0.952±0.012	0.918±0.002	0.970±0.001	0.976±0.002

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from torchrl_mcp.analysis.results import find_runs
-from torchrl_mcp.report import main, report
+from torchrl_mcp.cli.report import main, report
+from torchrl_mcp.report.results import find_runs
 
 MOMENT = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 VOID = {"meta", "br", "link", "img", "hr", "input"}

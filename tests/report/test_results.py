@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from torchrl_mcp.analysis.results import Damaged, Run, find_runs, read_run
+from torchrl_mcp.report.results import Damaged, Run, find_runs, read_run
 
 
 def test_runs_are_found_at_any_depth_and_each_once(write_run, tmp_path):

@@ -1,8 +1,8 @@
 import pytest
 
-from torchrl_mcp.analysis.comparison import cells
-from torchrl_mcp.analysis.results import read_run
-from torchrl_mcp.analysis.usage import diagnostics, usage, verdict
+from torchrl_mcp.report.comparison import cells
+from torchrl_mcp.report.results import read_run
+from torchrl_mcp.report.usage import diagnostics, usage, verdict
 
 GATES = {"gates/effective_primitives": 2.0, "gates/sum": 1.5, "gates/usage_0": 0.9, "gates/usage_1": 0.6}
 OPTIONS = {"options/effective_options": 1.5, "options/begin_rate": 0.1, "options/usage_0": 0.8, "options/usage_1": 0.2}

@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
-from torchrl_mcp.run_folder import METRICS
+from torchrl_mcp.training.run_folder import METRICS
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_mcp.actors import Composition, DeterministicAction
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.evaluation import evaluate
+from torchrl_mcp.evaluation.rollout import evaluate
+from torchrl_mcp.methods.actor import Composition
+from torchrl_mcp.methods.mcp import DeterministicAction
 
 Array = NDArray[np.float64]
 

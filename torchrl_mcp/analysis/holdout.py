@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchrl_mcp.analysis.figures import DIRECTIONS, FAINT, INK, new_figure
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.evaluation import evaluate
+from torchrl_mcp.evaluation.rollout import evaluate
 
 QUARTERS = {"0": 0.0, "π/2": math.pi / 2, "π": math.pi, "3π/2": 1.5 * math.pi}
 

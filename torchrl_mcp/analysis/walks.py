@@ -9,7 +9,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.actors import PRIMITIVES
 from torchrl_mcp.analysis.gait import Feet, stride_phases
 from torchrl_mcp.analysis.specialisation import (
     PHASE_BINS,
@@ -22,6 +21,7 @@ from torchrl_mcp.analysis.specialisation import (
     stance_correlation,
 )
 from torchrl_mcp.envs import Imitation
+from torchrl_mcp.methods.actor import PRIMITIVES
 
 Array = NDArray[np.float64]
 

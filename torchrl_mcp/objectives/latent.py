@@ -7,7 +7,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_mcp.latent import ENCODING
+from torchrl_mcp.methods.latent_space import ENCODING
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 
 
@@ -22,7 +22,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     here it acts in both, on :math:`q(w|s, g)` at transfer.
 
     Args:
-        actor_network: The policy, of :func:`torchrl_mcp.latent.latent_actor`.
+        actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
         critic_network: The value function.
         kl_coeff: Weight of the penalty, :math:`\beta`.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
-from torchrl_mcp.options import EpsilonGreedy, of_option
+from torchrl_mcp.methods.options import EpsilonGreedy, of_option
 
 
 class OptionAdvantages:

@@ -5,7 +5,7 @@ import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.gait import stride, walk
+from torchrl_mcp.envs.motions.gait.generator import stride, walk
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.motions.kinematics import body_states
 from torchrl_mcp.envs.motions.library import MotionLibrary

@@ -1,0 +1,72 @@
+"""Where in its reference motions a character fails."""
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.library import MotionLibrary
+
+PERIOD = 1.0
+"""Seconds of a clip that are counted together, and how long before a failure an attempt to avoid it may begin."""
+
+MEMORY = 0.9997
+"""Share of the counts that remains after a control step: they reach back about 100 s."""
+
+PRIOR_STEPS, PRIOR_FAILURES = 100.0, 1.0
+"""What every period is taken to have seen before anything was counted."""
+
+
+class AdaptiveSampler:
+    r"""Counts how often references are lost, second by second, and draws moments accordingly.
+
+    .. math:: P(j) \propto W_j \lambda_j
+
+    where :math:`\lambda_j` is the recent share of the steps in period j that ended an episode, and :math:`W_j` how
+    often the library draws the period. A moment is drawn evenly from the period and the second before it.
+
+    Args:
+        library: The reference motions.
+    """
+
+    def __init__(self, library: MotionLibrary) -> None:
+        numbers = (library.durations / PERIOD).ceil().long().clamp_min(1)
+        self._clips = torch.arange(len(library)).repeat_interleave(numbers)
+        self._first = numbers.cumsum(0) - numbers
+        self._begins = PERIOD * (torch.arange(len(self._clips)) - self._first[self._clips])
+        self._durations, self._loops = library.durations, library.loops
+        lasts = (library.durations[self._clips] - self._begins).clamp_max(PERIOD)
+        self._weights = (library.weights / library.durations)[self._clips] * lasts
+        self.steps = torch.full_like(self._weights, PRIOR_STEPS)
+        self.failures = torch.full_like(self._weights, PRIOR_FAILURES)
+
+    def count(self, clips: Tensor, times: Tensor, failed: Tensor) -> None:
+        """Count a step of N simulations, and let old ones fade.
+
+        Args:
+            clips: Index of the clip that each followed, shape ``(N,)``.
+            times: Seconds since its first frame, shape ``(N,)``.
+            failed: Whether the step ended the episode, shape ``(N,)``, bool.
+        """
+        durations = self._durations[clips]
+        within = torch.where(self._loops[clips], times % durations, torch.minimum(times, durations))
+        last = (durations / PERIOD).ceil().long() - 1
+        periods = self._first[clips] + torch.minimum((within / PERIOD).long(), last.clamp_min(0))
+        steps, failures = (torch.bincount(chosen, minlength=len(self.steps)) for chosen in (periods, periods[failed]))
+        self.steps, self.failures = MEMORY * self.steps + steps, MEMORY * self.failures + failures
+
+    def draw(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw moments: clips ``(num,)``, int64, and times in seconds ``(num,)``, float64."""
+        periods = torch.multinomial(
+            self._weights * self.failures / self.steps, num, replacement=True, generator=generator
+        )
+        clips = self._clips[periods]
+        ahead, lead = torch.rand(2, num, generator=generator, dtype=torch.float64)
+        times = self._begins[periods] + PERIOD * (ahead - lead)
+        return clips, times.clamp_min(0.0).minimum(self._durations[clips])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the counts."""
+        return {"steps": self.steps, "failures": self.failures}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.steps, self.failures = state["steps"].clone(), state["failures"].clone()

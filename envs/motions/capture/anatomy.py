@@ -1,0 +1,106 @@
+"""Which joint of a skeleton is the knee? Names of joints differ from one maker to the next."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
+
+from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+
+SIDES = ("right", "left")
+
+LEG = ("hip", "knee", "ankle")
+ARM = ("shoulder", "elbow", "wrist")
+"""Joints of a limb, from the trunk outwards."""
+
+# What BVH exporters, CMU, SMPL, game engines and animation programs call them, the less ambiguous names first:
+# LeftShoulder is a collar bone where there is a LeftArm, and LeftHip the side of a pelvis where there is a LeftUpLeg.
+NAMES = {
+    "hip": ("upleg", "upperleg", "thigh", "femur", "hip"),
+    "knee": ("knee", "lowleg", "lowerleg", "shin", "calf", "tibia", "leg"),
+    "ankle": ("ankle", "foot"),
+    "shoulder": ("uparm", "upperarm", "humerus", "shldr", "arm", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowarm", "lowerarm", "radius"),
+    "wrist": ("hand", "wrist"),
+}
+HEADS = ("head", "upperneck", "neck1", "neck")
+
+
+def limb(side: str, joints: tuple[str, str, str]) -> tuple[str, str, str]:
+    """Name the parts of one limb, from the trunk outwards."""
+    first, middle, last = joints
+    return f"{side}_{first}", f"{side}_{middle}", f"{side}_{last}"
+
+
+def bones(joints: tuple[str, str, str]) -> Iterator[tuple[str, str]]:
+    """Name both ends of all bones of the legs or of the arms."""
+    for side in SIDES:
+        first, middle, last = limb(side, joints)
+        yield first, middle
+        yield middle, last
+
+
+TRUNK = ("root", "chest")
+LEGS = tuple(part for side in SIDES for part in limb(side, LEG))
+HEAD_AND_ARMS = ("neck", *(part for side in SIDES for part in limb(side, ARM)))
+"""Parts of a body by the names of the humanoid's bodies; each begins at the joint on which it hangs."""
+
+
+def find_joints(
+    source: SourceMotion, parts: Sequence[str], joint_map: Mapping[str, str] | None = None
+) -> dict[str, int]:
+    """Find the joints at which parts of the body begin.
+
+    The root is where the legs come together, the chest where the arms do; the others are found by name.
+
+    Args:
+        source: The motion with its skeleton.
+        parts: Names of bodies of the humanoid: ``root``, ``chest``, ``neck`` (the head), ``left_hip``, ...
+        joint_map: Names of joints by part, for those that are not found, or wrongly.
+
+    Returns:
+        Index of a joint for each part.
+
+    Raises:
+        MotionFormatError: If the skeleton has not a joint that the map names, or one is not found.
+        ValueError: If the map is about what is no part of the body.
+    """
+    given, known = joint_map or {}, (*TRUNK, *LEGS, *HEAD_AND_ARMS)
+    if wrong := sorted(given.keys() - set(known)):
+        raise ValueError(f"joint_map has {', '.join(wrong)}: the parts of the body are {', '.join(known)}")
+    if absent := [name for name in given.values() if name not in source.names]:
+        raise MotionFormatError(source.path, f"has no joint {absent[0]!r}: its joints are {', '.join(source.names)}")
+    plain = _plain(source.names)
+    joints = {
+        part: plain.index(found[0])
+        for part in (*LEGS, *HEAD_AND_ARMS)
+        if (found := [name for name in _spellings(part) if name in plain])
+    }
+    joints |= {part: source.names.index(name) for part, name in given.items()}
+    for part, first in (("root", "hip"), ("chest", "shoulder")):
+        ends = [joints[f"{side}_{first}"] for side in SIDES if f"{side}_{first}" in joints]
+        if part not in joints and len(ends) == 2:
+            joints[part] = next(joint for joint in source.ancestors(ends[0]) if joint in source.ancestors(ends[1]))
+    if missing := [part for part in parts if part not in joints]:
+        raise MotionFormatError(
+            source.path,
+            f"has no joint known as {', '.join(missing)}: say which it is with a map, such as "
+            f"{missing[0]}={source.names[0]}; its joints are {', '.join(source.names)}",
+        )
+    return {part: joints[part] for part in parts}
+
+
+def _plain(names: Sequence[str]) -> list[str]:
+    """Names in small letters, without what all of them begin with: ``mixamorig:LeftUpLeg`` is ``leftupleg``."""
+    shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False)))
+    return [re.sub(r"[^a-z0-9]", "", name[shared:].rpartition(":")[2].lower()) for name in names]
+
+
+def _spellings(part: str) -> Iterator[str]:
+    """How a part may be spelled, the better guesses first."""
+    if part == "neck":
+        yield from HEADS
+        return
+    side, joint = part.split("_")
+    for word in NAMES[joint]:
+        yield from (f"{side}{word}", f"{side[0]}{word}", f"{word}{side}", f"{word}{side[0]}")

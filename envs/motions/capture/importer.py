@@ -1,0 +1,59 @@
+"""Recorded motion of any supported format as a clip of a character."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
+from torchrl_mcp.envs.motions.capture.bvh import read_bvh
+from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.capture.retarget import retarget
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+
+
+def import_motion(
+    path: str | Path,
+    character: str,
+    *,
+    rate: float = 30.0,
+    fps: float | None = None,
+    scale: float | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    skip: int = 0,
+    rest_frame: int | None = None,
+    asf: str | Path | None = None,
+) -> MotionClip:
+    """Read a motion file and carry it over to the humanoid or the biped.
+
+    The name says what the file is: ``.bvh``, ``.amc`` (with its ``.asf``), or ``.json`` or ``.txt`` for DeepMimic's.
+    Those hold the joints of the two characters, in metres; ``fps`` alone of the later options applies to them.
+
+    Args:
+        path: The file.
+        character: ``"humanoid"`` or ``"biped"``.
+        rate: Frames per second of the clip, or the nearest that divides it into whole frames.
+        fps: Frames per second of the file; None for what it says, or 120 for ``.amc``.
+        scale: Metres per unit of length; None for what the file says or the length of the legs suggests.
+        joint_map: See :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints`.
+        skip: Frames to leave out at the beginning.
+        rest_frame: Frame, from 0 and before any are left out, in which the body stands upright, for a file whose rest
+            pose does not.
+        asf: Skeleton of an ``.amc`` file; None for the one beside it.
+
+    Raises:
+        MotionFormatError: If the file cannot be used as it is.
+        ValueError: If an argument is out of range, or does not apply to the file.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix in (".json", ".txt"):
+        options = {"scale": scale, "joint_map": joint_map, "skip": skip or None, "rest_frame": rest_frame, "asf": asf}
+        if given := [name for name, value in options.items() if value is not None]:
+            raise ValueError(f"{given[0]} does not apply to {path}, a file of DeepMimic's: leave it out")
+        return read_deepmimic(path, character, rate=rate, fps=fps)
+    if suffix == ".bvh":
+        source = read_bvh(path, fps=fps)
+    elif suffix == ".amc":
+        source = read_asf_amc(path, asf=asf, fps=fps)
+    else:
+        raise MotionFormatError(path, "ends in none of .bvh, .amc, .json and .txt: pass a motion, or rename it")
+    return retarget(source, character, rate=rate, scale=scale, joint_map=joint_map, skip=skip, rest_frame=rest_frame)

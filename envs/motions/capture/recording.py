@@ -1,0 +1,147 @@
+"""A recorded human body, seen as the character would be."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchrl_mcp.envs.motions.capture.anatomy import ARM, LEG, bones, find_joints
+from torchrl_mcp.envs.motions.capture.build import LONGEST, TOP_SPEED, speeds
+from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
+from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.rotations import inverse, multiply
+
+UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
+"""Metres per unit of length: m, cm, mm, inches and CMU's. At most one of them makes a leg as long as legs are."""
+
+LEG_LENGTHS = (0.7, 1.0)
+"""Metres from hip to ankle, of adults."""
+
+
+class Recording(NamedTuple):
+    """Parts of a body, by name, in metres and the character's axes: x forward, y left, z up while it stands.
+
+    Attributes:
+        positions: Where each part begins, shape ``(T, 3)``.
+        turns: Rotation of each since it stood, shape ``(T, 4)``.
+        standing: Where each began then, shape ``(3,)``.
+        times: Of the frames, from 0, shape ``(T,)``, in seconds.
+    """
+
+    positions: Mapping[str, Tensor]
+    turns: Mapping[str, Tensor]
+    standing: Mapping[str, Tensor]
+    times: Tensor
+
+    def direction(self, start: str, end: str) -> Tensor:
+        """Unit vectors from one part's beginning to another's, shape ``(T, 3)``."""
+        return normalize(self.positions[end] - self.positions[start], dim=-1)
+
+    def leg_length(self) -> float:
+        """Mean length of thigh and shank together."""
+        return _leg_length(self.positions)
+
+
+def record(
+    source: SourceMotion,
+    parts: Sequence[str],
+    *,
+    scale: float | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    skip: int = 0,
+    rest_frame: int | None = None,
+) -> Recording:
+    """Find the parts of a body in a motion; see :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`."""
+    joints = find_joints(source, parts, joint_map)
+    rest = source.rest if rest_frame is None else source.pose(rest_frame)
+    source = source.without_first(skip)
+    _require_end(source)
+    pose = source.poses()
+    axes = _standing_axes(source, {part: rest.positions[joint] for part, joint in joints.items()})
+    metres = _metres_per_unit(source, {part: pose.positions[:, joint] for part, joint in joints.items()}, scale)
+    positions, standing = metres * pose.positions @ axes.mT, metres * rest.positions @ axes.mT
+    turns = multiply(pose.rotations, inverse(rest.rotations).expand_as(pose.rotations))
+    turns = torch.cat([turns[..., :1], turns[..., 1:] @ axes.mT], dim=-1)
+    recording = Recording(
+        positions={part: positions[:, joint] for part, joint in joints.items()},
+        turns={part: turns[:, joint] for part, joint in joints.items()},
+        standing={part: standing[joint] for part, joint in joints.items()},
+        times=torch.arange(len(source.lines), dtype=torch.float64) / source.fps,
+    )
+    _require_bones(source, recording)
+    _require_no_jump(source, recording)
+    return recording
+
+
+def _require_end(source: SourceMotion) -> None:
+    seconds = (len(source.lines) - 1) / source.fps
+    if seconds > LONGEST:
+        raise MotionFormatError(source.path, f"lasts {seconds:.0f} s, more than an hour: correct the rate, or split it")
+
+
+def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor]) -> Tensor:
+    """Forward, left and up in the axes of the source, the rows of a rotation matrix, shape ``(3, 3)``."""
+    upwards = rest["right_hip"] + rest["left_hip"] - rest["right_ankle"] - rest["left_ankle"]
+    main = int(upwards.abs().argmax())
+    up = AXES[main] * upwards[main].sign()
+    across = rest["left_hip"] - rest["right_hip"]
+    left = normalize(across - (across @ up) * up, dim=-1)
+    legs = [float(normalize(rest[end] - rest[start], dim=-1) @ up) for start, end in bones(LEG)]
+    arms = [float(normalize(rest[end] - rest[start], dim=-1) @ up) for start, end in bones(ARM) if start in rest]
+    if max(legs) > -0.5 or max(arms, default=0.0) > 0.9 or not left.any():
+        raise MotionFormatError(
+            source.path,
+            "its rest pose does not stand with the legs straight and the arms down or to the sides: say in which frame "
+            "it does (rest frame), or with a map which joints are which",
+        )
+    return torch.stack([torch.linalg.cross(left, up), left, up])
+
+
+def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scale: float | None) -> float:
+    """Choose the unit, and check that it makes the legs as long as legs are."""
+    if scale is not None and not 0 < scale < math.inf:
+        raise ValueError(f"scale={scale} is no unit of length: pass metres per unit, such as 0.01 for centimetres")
+    length, (low, high) = _leg_length(positions), LEG_LENGTHS
+    fitting = [unit for unit in UNITS if low <= unit * length <= high]
+    metres = scale or source.unit or (fitting[0] if fitting else 1.0)
+    if not low <= metres * length <= high:
+        raise MotionFormatError(
+            source.path,
+            f"from hip to ankle it measures {length:.4g} units, which at {metres:.4g} m each are "
+            f"{metres * length:.3g} m and should be {low} to {high} m: give the scale, in metres per unit",
+        )
+    return metres
+
+
+def _leg_length(positions: Mapping[str, Tensor]) -> float:
+    lengths = [torch.linalg.vector_norm(positions[end] - positions[start], dim=-1) for start, end in bones(LEG)]
+    return float(torch.stack(lengths).sum(0).mean() / 2)
+
+
+def _require_bones(source: SourceMotion, recording: Recording) -> None:
+    """Refuse limbs without length, which have no direction."""
+    for start, end in (*bones(LEG), *bones(ARM)):
+        if start in recording.positions:
+            lengths = torch.linalg.vector_norm(recording.positions[end] - recording.positions[start], dim=-1)
+            if lengths.min() < 0.05:
+                message = f"{start} and {end} come closer than 5 cm: say with a map which joints they are"
+                raise MotionFormatError(source.path, message, source.lines[int(lengths.argmin())])
+
+
+def _require_no_jump(source: SourceMotion, recording: Recording) -> None:
+    """Refuse a recording that jumps, as those do whose first frame is a pose to calibrate with."""
+    for part, positions in recording.positions.items():
+        fast = speeds(positions, recording.times) > TOP_SPEED
+        if fast.any():
+            frame = int(fast.nonzero()[0]) + 1
+            first = "leave out the first, which seems to be a T-pose (skip)"
+            other = "cut the file there, or correct the order of its rotations"
+            raise MotionFormatError(
+                source.path,
+                f"{part} jumps between frames {frame} and {frame + 1}, faster than {TOP_SPEED:g} m/s: "
+                f"{first if frame == 1 else other}",
+                source.lines[frame],
+            )

@@ -1,0 +1,178 @@
+"""Motion of any human skeleton, carried over to a character."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, SIDES, TRUNK, limb
+from torchrl_mcp.envs.motions.capture.build import assembled, require_human, speeds
+from torchrl_mcp.envs.motions.capture.recording import Recording, record
+from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate
+
+BENT = math.radians(15)
+"""Flexion from which on a knee or an elbow shows the plane in which it bends."""
+
+STILL = 0.15
+"""m/s. An ankle is slower while its foot is flat on the ground."""
+
+STEEPEST = 0.05
+"""Metres per metre: three degrees, beyond which it is not the laboratory that slopes."""
+
+UP = AXES[2]
+
+
+def retarget(
+    source: SourceMotion,
+    character: str,
+    *,
+    scale: float | None = None,
+    rate: float = 30.0,
+    joint_map: Mapping[str, str] | None = None,
+    skip: int = 0,
+    rest_frame: int | None = None,
+) -> MotionClip:
+    """Carry a recorded motion over to the humanoid or the biped.
+
+    Parts of the character turn as those of the recorded body do, relative to a standing pose: legs and arms straight
+    down. A bone that the source's rest pose holds otherwise, such as the arms of a T, is first brought there the
+    shortest way. Knees and elbows are hinges: they flex by the angle between the bones, and thigh and upper arm are
+    twisted so that the hinge lies across the plane of the limb. The root goes with the middle of the hips; its path is
+    scaled by the length of the legs. A constant turn sets each foot flat, a constant shift the clip on the ground.
+
+    Args:
+        source: The motion.
+        character: ``"humanoid"``, or ``"biped"``, which has neither head nor arms.
+        scale: Metres per unit of the source, or None for what the file says or else the length of the legs suggests.
+        rate: Frames per second of the clip, or the nearest that divides it into whole frames.
+        joint_map: See :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints`.
+        skip: Frames to leave out at the beginning.
+        rest_frame: Frame, from 0 and before any are left out, in which the source stands upright, for one whose rest
+            pose does not.
+
+    Raises:
+        MotionFormatError: If the motion cannot be that of a human body: in build, in size, or in speed.
+        ValueError: If an argument is out of range.
+    """
+    require_human(character)
+    has_arms = character == "humanoid"
+    parts = (*TRUNK, *LEGS, *(HEAD_AND_ARMS if has_arms else ()))
+    body = record(source, parts, scale=scale, joint_map=joint_map, skip=skip, rest_frame=rest_frame)
+    root, chest = body.turns["root"], body.turns["chest"]
+    motion = {"root": root, "chest": _relative(root, chest)}
+    for side in SIDES:
+        hip, knee, ankle = limb(side, LEG)
+        thigh, motion[knee] = _hinged(body, limb(side, LEG), forward=-1.0)
+        shank, foot = multiply(thigh, _flexed(motion[knee])), _flat(body, ankle)
+        motion[hip], motion[ankle] = _relative(root, thigh), _relative(shank, foot)
+        if has_arms:
+            shoulder, elbow, _ = limb(side, ARM)
+            upper_arm, motion[elbow] = _hinged(body, limb(side, ARM), forward=1.0)
+            motion[shoulder] = _relative(chest, upper_arm)
+    if has_arms:
+        motion["neck"] = _relative(chest, body.turns["neck"])
+    hips = (body.positions["right_hip"] + body.positions["left_hip"]) / 2
+    hips[:, 2] -= hips[:, :2] @ _slope(body)
+    path = hips * (leg_length(character) / body.leg_length())
+    return assembled(character, path, motion, body.times, rate=rate)
+
+
+def leg_length(character: str) -> float:
+    """Metres from hip to ankle of a character's straight leg."""
+    model = character_model(character)
+    return -float(model.body("right_knee").pos[2] + model.body("right_ankle").pos[2])
+
+
+def _relative(parent: Tensor, child: Tensor) -> Tensor:
+    """Rotation of a part in the frame of the one that it hangs on, shape ``(T, 4)``."""
+    return multiply(inverse(parent), child)
+
+
+def _flexed(angle: Tensor) -> Tensor:
+    """Rotation of a hinge, about -y, shape ``(T, 4)``."""
+    return from_rotation_vector(angle.unsqueeze(-1) * -AXES[1])
+
+
+def _hinged(body: Recording, joints: tuple[str, str, str], *, forward: float) -> tuple[Tensor, Tensor]:
+    r"""Fit a limb whose middle joint is a hinge about -y.
+
+    With the direction :math:`l` of its lower bone in the frame of the upper, whose own is -z, the upper bone is twisted
+    by the azimuth :math:`\varphi` of :math:`l`, so that none of it is sideways, and then
+
+    .. math:: \theta = \operatorname{atan2}(l_x \cos \varphi + l_y \sin \varphi, -l_z)
+
+    A limb that is nearly straight has no plane: its twist is interpolated between the frames before and after.
+
+    Args:
+        body: The recorded motion.
+        joints: Of the limb, from the trunk outwards.
+        forward: 1 for a limb that flexes forward, -1 for one that flexes backward.
+
+    Returns:
+        Rotation of the upper bone, shape ``(T, 4)``, and angle of the hinge, shape ``(T,)``.
+    """
+    start, middle, end = joints
+    standing = normalize(body.standing[middle] - body.standing[start], dim=-1)
+    upper = multiply(body.turns[start], _shortest(-UP, standing).expand_as(body.turns[start]))
+    bone = body.direction(start, middle)
+    upper = multiply(
+        _shortest(rotate(upper, -UP.expand_as(bone)), bone), upper
+    )  # for bones that position channels move
+    x, y, z = rotate(inverse(upper), body.direction(middle, end)).unbind(-1)
+    twist = _interpolated(torch.atan2(forward * y, forward * x), torch.atan2(torch.hypot(x, y), -z) > BENT)
+    return multiply(upper, about_z(twist)), torch.atan2(x * twist.cos() + y * twist.sin(), -z)
+
+
+def _shortest(a: Tensor, b: Tensor) -> Tensor:
+    """Shortest rotation from one unit vector to another, shape ``(*B, 4)``."""
+    turn = torch.cat([1 + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], dim=-1)
+    across = torch.linalg.cross(a, torch.where(a[..., :1].abs() < 0.9, AXES[0], AXES[1]))
+    half_turn = torch.cat([torch.zeros_like(across[..., :1]), across], dim=-1)
+    return normalize(torch.where(turn.norm(dim=-1, keepdim=True) < 1e-9, half_turn, turn), dim=-1)
+
+
+def _interpolated(angles: Tensor, known: Tensor) -> Tensor:
+    """Continuous angles over time, shape ``(T,)``, interpolated where they are not known; 0 if none is."""
+    if not known.any():
+        return torch.zeros_like(angles)
+    frames = known.nonzero().squeeze(-1).numpy()
+    return torch.from_numpy(np.interp(np.arange(len(angles)), frames, np.unwrap(angles[known].numpy())))
+
+
+def _flat(body: Recording, ankle: str) -> Tensor:
+    """Turn a foot by a constant so that its sole is level, in the median, while it does not move, shape ``(T, 4)``."""
+    foot = body.turns[ankle]
+    still = foot[_still(body, ankle)]
+    if not len(still):
+        return foot
+    normal = rotate(inverse(still), UP.expand(len(still), 3)).median(dim=0).values
+    return multiply(foot, _shortest(UP, normalize(normal, dim=-1)).expand_as(foot))
+
+
+def _slope(body: Recording) -> Tensor:
+    r"""Rise of the ground per metre along x and y, shape ``(2,)``: laboratories are not quite level.
+
+    With the ankles that stand at :math:`(p, z)`, less their means, it is the plane through them, held flat where they
+    do not show one:
+
+    .. math:: s = (\langle p p^T \rangle + r^2 I)^{-1} \langle p z \rangle, \quad r = 0.3 \text{ m}
+    """
+    standing = torch.cat([body.positions[ankle][_still(body, ankle)] for ankle in ("right_ankle", "left_ankle")])
+    if not len(standing):
+        return torch.zeros(2, dtype=torch.float64)
+    place, height = (standing - standing.mean(0)).split([2, 1], dim=-1)
+    spread = place.mT @ place / len(place) + 0.3**2 * torch.eye(2, dtype=torch.float64)
+    slope = torch.linalg.solve(spread, place.mT @ height / len(place)).squeeze(-1)
+    return slope if slope.norm() < STEEPEST else torch.zeros_like(slope)  # steeper: stairs, or a pit
+
+
+def _still(body: Recording, ankle: str) -> Tensor:
+    """Frames in which an ankle does not move, shape ``(T,)``, bool."""
+    slow = speeds(body.positions[ankle], body.times) < STILL
+    return torch.cat([slow[:1], slow])

@@ -1,0 +1,1 @@
+"""What clips look like: measures, feasibility and pictures."""

@@ -1,0 +1,181 @@
+"""Measures of a walk, taken from its poses alone."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.inspection.signals import Leg, Root, leg_signals, root_signals, smoothed, unwrapped
+from torchrl_mcp.envs.motions.inspection.strides import Stride, find_strides
+from torchrl_mcp.envs.motions.kinematics import body_states
+from torchrl_mcp.envs.rotations import heading
+
+LEAST_FPS = 60.0
+"""Below which a clip is resampled, for events to be found to a hundredth of a second."""
+
+
+class GaitStatistics(NamedTuple):
+    """Measures of S strides, each of shape ``(S,)``, in metres, seconds and degrees.
+
+    Angles of thigh, arm and foot are those in the plane of progression, forward and toes up being positive; list and
+    roll are about the direction of progression. A range is the greatest value minus the least. Arms are NaN where there
+    are none.
+
+    Args:
+        stride_time: From a heel strike to the next of the same foot.
+        speed: Along the heading, in m/s.
+        turn_rate: To the left, in rad/s.
+        step_width: Between the ankles in their mid-stances, across the heading.
+        stance: Fraction of the stride with the foot down.
+        double_support: Fraction with both feet down, both times together.
+        bob: Range of the root's height.
+        sway: Range of the root's way to the sides of its path.
+        thigh_forward: Greatest angle.
+        thigh_back: Least angle.
+        knee_strike: Flexion at heel strike.
+        knee_loading: Greatest flexion in the first 30 % of the stride.
+        knee_stance: Least flexion between 20 and 50 %.
+        knee_swing: Greatest flexion.
+        ankle_dorsiflexion: Greatest between 30 and 62 %.
+        ankle_plantarflexion: Least dorsiflexion between 55 and 85 %.
+        pitch_strike: Of the foot at heel strike.
+        pitch_toe_off: Least pitch of the foot, which is that shortly after toe-off.
+        pelvis_yaw: Range.
+        pelvis_list: Range.
+        shoulder_yaw: Range, of the trunk.
+        yaw_correlation: Between pelvis and trunk: -1 where they swing against each other.
+        trunk_roll: Range.
+        trunk_lean: Mean roll of the trunk to the left.
+        arm_swing: Range of the upper arm's angle.
+        elbow_mean: Mean flexion.
+        elbow_swing: Range of flexion.
+        toe_clearance: Height of the toes' sole that is exceeded in 5 % of the stride, over that exceeded in 95 %.
+        slide: Median horizontal speed of the ankle between 15 and 40 %, in m/s.
+    """
+
+    stride_time: Tensor
+    speed: Tensor
+    turn_rate: Tensor
+    step_width: Tensor
+    stance: Tensor
+    double_support: Tensor
+    bob: Tensor
+    sway: Tensor
+    thigh_forward: Tensor
+    thigh_back: Tensor
+    knee_strike: Tensor
+    knee_loading: Tensor
+    knee_stance: Tensor
+    knee_swing: Tensor
+    ankle_dorsiflexion: Tensor
+    ankle_plantarflexion: Tensor
+    pitch_strike: Tensor
+    pitch_toe_off: Tensor
+    pelvis_yaw: Tensor
+    pelvis_list: Tensor
+    shoulder_yaw: Tensor
+    yaw_correlation: Tensor
+    trunk_roll: Tensor
+    trunk_lean: Tensor
+    arm_swing: Tensor
+    elbow_mean: Tensor
+    elbow_swing: Tensor
+    toe_clearance: Tensor
+    slide: Tensor
+
+    def select(self, strides: Tensor) -> "GaitStatistics":
+        """Keep the strides of a mask, shape ``(S,)``."""
+        return GaitStatistics(*(field[strides] for field in self))
+
+    def medians(self) -> dict[str, float]:
+        """Median of each measure over the strides, by name."""
+        return {name: float(field.quantile(0.5)) for name, field in self._asdict().items()}
+
+
+def gait_statistics(clip: MotionClip) -> GaitStatistics:
+    """Measure every whole stride of a humanoid or biped, of either foot, that is not interrupted by a stop.
+
+    Args:
+        clip: Of a character whose legs have thigh, shank and foot; a loop is unrolled.
+    """
+    clip = _prepared(clip)
+    states = body_states(clip.character, clip.qpos, clip.qvel)
+    coarse = root_signals(clip, states, window=1.0)
+    strides = find_strides({side: leg_signals(clip, states, side, coarse) for side in ("right", "left")}, clip.fps)
+    if not strides:
+        return GaitStatistics(*torch.empty(len(GaitStatistics._fields), 0, dtype=torch.float64))
+    # A Hann window two strides long removes all that repeats with the stride.
+    typical = torch.tensor([stride.end - stride.start for stride in strides]).median()
+    root = root_signals(clip, states, window=2 * float(typical) / clip.fps)
+    legs = {side: leg_signals(clip, states, side, root) for side in ("right", "left")}
+    rows = [_measured(stride, root, legs, clip.fps) for stride in strides]
+    return GaitStatistics(*torch.tensor(rows, dtype=torch.float64).unbind(-1))
+
+
+def speed_and_turn_rate(clip: MotionClip, window: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Speed in m/s along the heading, and turn rate in rad/s, of the root at every frame, each ``(T,)``.
+
+    Args:
+        clip: Any.
+        window: Length in seconds of the Hann window that smooths them.
+    """
+    yaw = smoothed(unwrapped(heading(clip.qpos[:, 3:7])), clip.fps, window)
+    forward = (clip.qvel[:, :2] * torch.stack([yaw.cos(), yaw.sin()], dim=-1)).sum(-1)
+    return smoothed(forward, clip.fps, window), torch.gradient(yaw, spacing=1 / clip.fps)[0]
+
+
+def _prepared(clip: MotionClip) -> MotionClip:
+    """At least ten seconds of a loop, at a frame rate that is high enough."""
+    if clip.loop:
+        times = torch.arange(0, max(10.0, clip.duration), 1 / clip.fps, dtype=torch.float64)
+        clip = MotionClip(clip.character, clip.at(times), clip.fps)
+    return clip if clip.fps >= LEAST_FPS else clip.resampled(2 * LEAST_FPS)
+
+
+def _measured(stride: Stride, root: Root, legs: dict[str, Leg], fps: float) -> list[float]:
+    """All of :class:`GaitStatistics` for one stride, in order."""
+    leg, other = legs[stride.side], legs[stride.other]
+    frames = stride.end - stride.start
+    both = (stride.other_toe_off - stride.start) + (stride.toe_off - stride.other_start)
+    turned = root.heading[stride.end] - root.heading[stride.start]
+    width = leg.across[stride.part(0.15, 0.4)].mean() - other.across[stride.part(0.65, 0.9)].mean()
+    whole = stride.part(0, 1)
+    yaws = torch.stack([root.pelvis_yaw[whole], root.trunk_yaw[whole]])
+    toes = leg.toe_height[whole].quantile(torch.tensor([0.05, 0.95], dtype=torch.float64))
+    values: dict[str, float | Tensor] = {
+        "stride_time": frames / fps,
+        "speed": root.speed[whole].mean(),
+        "turn_rate": turned * fps / frames,
+        "step_width": width.abs(),
+        "stance": (stride.toe_off - stride.start) / frames,
+        "double_support": both / frames,
+        "bob": _range(root.height[whole]),
+        "sway": _range(root.sway[whole]),
+        "thigh_forward": leg.thigh[whole].max(),
+        "thigh_back": leg.thigh[whole].min(),
+        "knee_strike": leg.knee[stride.start],
+        "knee_loading": leg.knee[stride.part(0, 0.3)].max(),
+        "knee_stance": leg.knee[stride.part(0.2, 0.5)].min(),
+        "knee_swing": leg.knee[whole].max(),
+        "ankle_dorsiflexion": leg.ankle[stride.part(0.3, 0.62)].max(),
+        "ankle_plantarflexion": leg.ankle[stride.part(0.55, 0.85)].min(),
+        "pitch_strike": leg.pitch[stride.start],
+        "pitch_toe_off": leg.pitch[whole].min(),
+        "pelvis_yaw": _range(root.pelvis_yaw[whole]),
+        "pelvis_list": _range(root.pelvis_list[whole]),
+        "shoulder_yaw": _range(root.trunk_yaw[whole]),
+        "yaw_correlation": torch.corrcoef(yaws)[0, 1],
+        "trunk_roll": _range(root.trunk_roll[whole]),
+        "trunk_lean": root.trunk_roll[whole].mean(),
+        "arm_swing": _range(leg.arm[whole]),
+        "elbow_mean": leg.elbow[whole].mean(),
+        "elbow_swing": _range(leg.elbow[whole]),
+        "toe_clearance": toes[1] - toes[0],
+        "slide": leg.ankle_speed[stride.part(0.15, 0.4)].median(),
+    }
+    return [float(values[name]) for name in GaitStatistics._fields]
+
+
+def _range(values: Tensor) -> Tensor:
+    return values.max() - values.min()

@@ -1,0 +1,172 @@
+import json
+import math
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+from PIL import Image
+
+from torchrl_mcp.cli import motions
+from torchrl_mcp.envs.motions.clip import MotionClip
+
+COLUMNS = [0.1, 0.0, 0.9, 0.0, *[1.0, 0, 0, 0] * 4, -0.2, *[1.0, 0, 0, 0] * 2, 0.4, *[1.0, 0, 0, 0], -0.1]
+COLUMNS += [*[1.0, 0, 0, 0] * 2, 0.3]
+"""A frame of DeepMimic's: standing with the joints a little bent."""
+
+
+def motion(seconds, loop="none", speed=1.0):
+    frames = [[0.1, speed * index / 10, *COLUMNS[2:]] for index in range(round(seconds * 10) + 1)]
+    return json.dumps({"Loop": loop, "Frames": frames})
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Call the program in an empty folder; return status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["torchrl-mcp-motions", *map(str, words)])
+        try:
+            motions.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return run
+
+
+def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
+    (tmp_path / "walk.txt").write_text(motion(2.0, speed=0.5))
+    (tmp_path / "stroll.json").write_text(motion(1.0, speed=0.3))
+    status, output, errors = run("import", "walk.txt", "stroll.json", "--mirror", "--output", "clips", "--rate", 20)
+    assert (status, errors) == (0, "")
+    clips = {path.stem: MotionClip.load(path) for path in (tmp_path / "clips").iterdir()}
+    assert set(clips) == {"walk", "walk_mirrored", "stroll", "stroll_mirrored"}
+    assert clips["walk"].fps == pytest.approx(20)
+    assert torch.equal(clips["walk_mirrored"].qpos, clips["walk"].mirrored().qpos)
+    lines = output.splitlines()
+    assert lines[1].split()[:-1] == ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg", "0.0", "cm"]
+    assert lines[2].split()[4] == "0.30"
+    assert [line.split()[0] for line in lines[2:5]] == ["stroll", "walk_mirrored", "stroll_mirrored"]
+    assert lines[5].split() == ["total", "6.0"]
+    assert lines[6] == "written to clips"
+
+
+def test_clips_and_recordings_can_be_inspected(run, tmp_path):
+    (tmp_path / "walk.txt").write_text(motion(1.0, "wrap"))
+    run("import", "walk.txt", "--character", "biped")
+    status, output, _ = run("inspect", "walk.npz")
+    assert status == 0
+    assert output.splitlines()[1].split()[:5] == ["walk", "biped", "1.00", "30", "loop"]
+    assert run("inspect", "walk.txt", "--character", "biped")[1] == output
+    assert {path.name for path in tmp_path.iterdir()} == {"walk.txt", "walk.npz"}
+
+
+def test_render_draws_a_sheet_and_a_film(run, tmp_path):
+    (tmp_path / "walk.txt").write_text(motion(1.0))
+    status, output, errors = run("render", "walk.txt", "--output", "pictures", "--seconds", 0.2)
+    if "no OpenGL" in errors:
+        pytest.skip(errors)
+    assert status == 0
+    assert output.split() == ["pictures/walk.png", "pictures/walk.gif"]
+    with (
+        Image.open(tmp_path / "pictures" / "walk.png") as sheet,
+        Image.open(tmp_path / "pictures" / "walk.gif") as film,
+    ):
+        assert sheet.size == (1600, 600)
+        assert film.n_frames in range(1, 6)  # equal frames are merged
+
+
+def test_a_motion_whose_feet_slide_is_pointed_out(run, tmp_path):
+    """One foot glides past the other at 1.5 m/s, and neither stands."""
+    frames = json.loads(motion(2.0, speed=1.5))
+    for index, columns in enumerate(frames["Frames"]):
+        angle = 0.3 * (-1) ** index
+        columns[16:20] = [math.cos(angle), 0.0, 0.0, math.sin(angle)]
+    (tmp_path / "skate.txt").write_text(json.dumps(frames))
+    assert run("inspect", "skate.txt")[1].splitlines()[-1].startswith("The feet slide in skate: unit, frame rate,")
+
+
+def corpus(folder, **seconds):
+    """The files of the paper's corpus, in which nobody moves a limb."""
+    (folder / "deep").mkdir(parents=True)
+    for name, duration in {**motions.PAPER_CORPUS, **seconds}.items():
+        if name.endswith(".txt"):
+            loop = "wrap" if name == "humanoid3d_walk.txt" else "none"
+            (folder / "deep" / name).write_text(motion(duration, loop, speed=0.1))
+
+
+def test_the_papers_corpus_lacks_what_was_not_downloaded(run, tmp_path):
+    corpus(tmp_path / "downloads")
+    status, _, errors = run("build-paper-corpus", "downloads")
+    assert status == 2
+    assert errors.startswith(
+        "torchrl-mcp-motions: downloads lacks\n  0005_Walking001.bvh (from https://mocap.cs.sfu.ca"
+    )
+    assert "humanoid3d" not in errors
+    assert not (tmp_path / "corpus").exists()
+
+
+def test_the_papers_corpus_takes_no_other_motion_of_that_name(run, tmp_path, monkeypatch):
+    corpus(tmp_path / "downloads", **{"humanoid3d_long_walk2.txt": 20.0})
+    (tmp_path / "downloads" / "0005_Walking001.bvh").write_text("?")
+    status, _, errors = run("build-paper-corpus", "downloads")
+    assert status == 2
+    assert "humanoid3d_long_walk2.txt lasts 20.00 s, and the paper's corpus needs 24.56 s" in errors
+
+
+@pytest.mark.parametrize("character", ["humanoid", "biped"])
+def test_the_papers_corpus_of_real_files_is_230_seconds_and_half_of_it_is_mirrored(run, mocap, tmp_path, character):
+    status, output, errors = run("build-paper-corpus", mocap, "--character", character)
+    assert (status, errors) == (0, "")
+    clips = {path.stem: MotionClip.load(path) for path in (tmp_path / "corpus").iterdir()}
+    assert sum(clip.duration for clip in clips.values()) == pytest.approx(229.6, abs=0.05)
+    assert ["total", "229.6"] in [line.split() for line in output.splitlines()]
+    assert len(clips) == 9
+    mirrored = [name for name in clips if name.endswith("_mirrored")]
+    assert len(mirrored) == 4
+    for name in mirrored:
+        assert torch.equal(clips[name].qpos, clips[name.removesuffix("_mirrored")].mirrored().qpos)
+    assert "slide in" not in output
+
+
+WRONG = {
+    "no command": ([], "required: command"),
+    "no file": (["import"], "required: FILE"),
+    "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: nowhere.bvh: cannot be read"),
+    "missing clip": (["inspect", "nowhere.npz"], "torchrl-mcp-motions: .*nowhere.npz"),
+    "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
+    "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
+    "no BVH": (["import", "broken.bvh"], r"broken\.bvh:1: does not begin with HIERARCHY"),
+    "wrong character": (["import", "a.bvh", "--character", "trex"], "invalid choice: 'trex'"),
+    "wrong map": (["import", "broken.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
+    "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
+    "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
+    "same name": (["inspect", "stand.txt", "more/stand.txt"], "two files are called stand"),
+    "missing folder": (["build-paper-corpus", "nowhere"], "nowhere lacks"),
+}
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message):
+    (tmp_path / "broken.bvh").write_text("nothing")
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
+    (tmp_path / "notes.md").write_text("nothing")
+    (tmp_path / "stand.txt").write_text(motion(1.0))
+    status, output, errors = run(*words)
+    assert status == 2
+    assert output == ""
+    assert re.search(message, errors)
+    assert "Traceback" not in errors
+
+
+def test_help_shows_examples():
+    command = [sys.executable, "-m", "torchrl_mcp.cli.motions", "--help"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd="/")
+    assert result.returncode == 0
+    for name in ("import", "inspect", "render", "build-paper-corpus"):
+        assert f"torchrl-mcp-motions {name} " in result.stdout

@@ -1,0 +1,78 @@
+import sys
+
+import pytest
+from PIL import Image
+
+from torchrl_mcp.cli import play
+from torchrl_mcp.envs import opengl
+
+
+def call(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-play", *map(str, arguments)])
+    play.main()
+
+
+def refused(monkeypatch, *arguments):
+    """What the program says instead of doing something."""
+    with pytest.raises(SystemExit) as stopped:
+        call(monkeypatch, *arguments)
+    return str(stopped.value)
+
+
+def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_for(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "films" / "film.gif"
+    try:
+        call(monkeypatch, "builtin:biped", "--output", path, "--seconds", 0.2, "--width", 160, "--height", 120)
+    except SystemExit as error:
+        if "no OpenGL" not in str(error):
+            raise
+        pytest.skip(str(error))
+    assert capsys.readouterr().out.strip() == str(path)
+    with Image.open(path) as gif:
+        assert gif.size == (160, 120)
+        assert gif.n_frames == 3
+
+
+def test_unknown_networks_are_refused_by_those_that_there_are(monkeypatch):
+    said = refused(monkeypatch, "builtin:horse")
+    assert "character=horse comes with the library" in said
+    assert all(f"mcp-{name}" in said for name in ("biped", "humanoid", "trex"))
+
+
+def test_a_folder_without_checkpoint_is_refused(monkeypatch, tmp_path):
+    assert "neither a checkpoint file nor a run folder" in refused(monkeypatch, tmp_path)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(monkeypatch, tmp_path):
+    (tmp_path / "notes.txt").write_text("no checkpoint")
+    assert "notes.txt is not a checkpoint" in refused(monkeypatch, tmp_path / "notes.txt")
+
+
+def test_an_unknown_argument_of_the_task_is_refused_by_name(monkeypatch):
+    said = refused(monkeypatch, "builtin:biped", "--task", "colour=red")
+    assert "--task colour=red" in said
+
+
+def test_a_wrong_argument_of_the_task_is_refused_by_the_task(monkeypatch):
+    assert "clip_end='sleep'" in refused(monkeypatch, "builtin:biped", "--task", "clip_end=sleep")
+
+
+def test_without_opengl_the_packages_to_install_are_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(opengl, "_works", lambda name: False)
+    opengl._platform.cache_clear()
+    said = refused(monkeypatch, "builtin:biped", "--output", tmp_path / "film.gif")
+    opengl._platform.cache_clear()
+    assert "libegl1" in said
+    assert "libosmesa6" in said
+
+
+def test_without_studio_the_web_viewer_says_which_mujoco_has_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchrl_mcp.viewer.web", None)
+    assert "install that" in refused(monkeypatch, "builtin:biped", "--viewer", "web")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_without_a_display_a_window_is_refused_with_what_to_do_instead(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "--viewer web" in refused(monkeypatch, "builtin:biped", "--viewer", "window")

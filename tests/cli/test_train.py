@@ -1,0 +1,101 @@
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+
+import torchrl_mcp.conf
+from torchrl_mcp.cli.train import main, suggestions
+from torchrl_mcp.runs import benchmark
+
+CONF = Path(torchrl_mcp.conf.__file__).parent
+PARTS = ("hierarchy",)  # of one method's configuration, which takes both
+CHOICES = [f"{file.parent.name}={file.stem}" for file in sorted(CONF.glob("*/*.yaml")) if file.parent.name not in PARTS]
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_of_every_group_composes(choice):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        compose("train", [choice])
+
+
+@pytest.mark.parametrize(
+    ("argument", "meant"),
+    [
+        ("num_primitivs=4", "num_primitives"),
+        ("trainig.num_envs=64", "training.num_envs"),
+        ("mixr=additive", "mixer"),
+        ("objective.loss.clip_epsilom=0.1", "objective.loss.clip_epsilon"),
+        ("hydra.swep.dir=runs", "hydra.sweep.dir"),
+    ],
+)
+def test_an_unknown_setting_is_answered_with_the_nearest_that_exist(argument, meant):
+    (line,) = suggestions([argument])
+    key, _ = argument.split("=")
+    assert line.startswith(f"'{key}' is no setting")
+    assert line.split("the nearest are: ")[1].split(", ")[0] == meant
+
+
+def test_a_setting_like_no_other_is_answered_with_the_groups():
+    (line,) = suggestions(["qqqqqqqq=1"])
+    for group in ("method", "mixer", "task", "preset"):
+        assert group in line
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["method=scratch", "preset=smoke", "seed=3", "training.num_envs=8", "stage.gamma=0.9"],
+        ["mixer=additive,multiplicative", "seed=range(3)", "--multirun"],
+        ["hydra.run.dir=out"],
+        ["+note=new"],
+        ["~logger"],
+        pytest.param(["method=scratch", "parts.policy.std=0.2"], id="a setting of another method"),
+        pytest.param(["preset=paper", "step_size.mcp.pretrain=1e-4"], id="a setting of another preset"),
+    ],
+)
+def test_settings_that_exist_are_left_alone(arguments):
+    assert suggestions(arguments) == []
+
+
+def test_only_the_unknown_among_several_are_answered():
+    lines = suggestions(["method=scratch", "parts.polcy.std=0.2", "seed=1", "sead=2"])
+    assert [line.split("'")[1] for line in lines] == ["parts.polcy.std", "sead"]
+    assert "parts.policy.std" in lines[0]
+
+
+@pytest.mark.parametrize("arguments", [["mixer"], ["a=[1,"], ["method=no_such", "sead=2"]])
+def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
+    assert suggestions(arguments) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (["benchmark=mixer", "sead=3"], "nearest are: seed"),
+        (["benchmark=mixr"], "exploration\n\tfreeze\n\tmixer"),
+        (["benchmark=mixer", "mixer=aditive"], "additive\n\tmultiplicative"),
+        (["benchmark=mixer", "--cfg", "job"], "not --cfg"),
+    ],
+)
+def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, capsys, arguments, answer):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code
+    said = capsys.readouterr().err + str(stop.value.code)
+    assert answer in said
+    assert "Traceback" not in said
+
+
+def test_a_benchmark_of_your_own_is_found(monkeypatch, tmp_path):
+    (tmp_path / "own" / "benchmark").mkdir(parents=True)
+    (tmp_path / "own" / "benchmark" / "mine.yaml").write_text("rows: [{method: [scratch]}]\nparams: {seed: '4'}\n")
+    planned = []
+    monkeypatch.setattr(benchmark, "launch", lambda jobs, launcher: planned.extend(jobs) or jobs)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "--config-dir", "own", "benchmark=mine"])
+    with pytest.raises(SystemExit, match="scratch"):  # what was planned has not been done
+        main()
+    assert [(job.config["method"]["name"], job.config["seed"]) for job in planned] == [("scratch", 4)]

@@ -1,0 +1,51 @@
+"""Exploration over the weights of frozen primitives: it plays their composite and scores the gate's logits."""
+
+import pytest
+import torch
+from torch import nn
+from torch.distributions import Independent, Normal
+
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.methods.mcp import weights_actor
+
+
+@pytest.mark.parametrize("mixer", [MultiplicativeGaussian, AdditiveGaussian])
+def test_exploration_over_weights_plays_the_composite_s_deterministic_action(mixer, composite, states):
+    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": mixer}
+    actor = weights_actor(composite(**heads), **heads, logits_std=0.2, frozen=["primitives"])
+    with torch.no_grad():
+        played = actor.policy(states(50))
+    gates = torch.sigmoid(played["gate_logits"])
+    assert torch.equal(played["gates"], gates)
+    loc, scale = played["primitives", "loc"], played["primitives", "scale"]
+    assert torch.equal(played["action"], mixer(loc, scale, gates).deterministic_sample)
+
+
+def test_exploration_over_weights_scores_the_gate_s_logits(make_actor, sample):
+    actor, parts = make_actor("weights")
+    assert (actor.sampled, actor.log_prob) == ("gate_logits", "gate_logits_log_prob")
+    stored = sample(actor, 50)
+    observation = parts["observation_normaliser"](stored["observation"])
+    loc = parts["gating"](observation, parts["goal_normaliser"](stored["goal"]))
+    score = Independent(Normal(loc, 0.2), 1).log_prob(stored["gate_logits"])
+    torch.testing.assert_close(stored["gate_logits_log_prob"], score)
+    deviation = ((stored["gate_logits"] - loc) / 0.2).square().mean().item()
+    assert deviation == pytest.approx(1, abs=0.4)  # 200 squared normal deviates: four standard errors
+
+    actor.trained.get_dist(stored).log_prob(stored["gate_logits"]).sum().backward()
+    assert all(parameter.grad.abs().max() > 0 for parameter in parts["gating"].parameters())
+    assert all(parameter.grad is None for parameter in parts["primitives"].parameters())
+
+
+@pytest.mark.parametrize("frozen", [(), ("observation_normaliser",)])
+def test_exploration_over_weights_refuses_primitives_that_are_not_frozen(frozen, composite):
+    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+    with pytest.raises(ValueError, match=r"primitives.*transfer\.freeze.*exploration=action"):
+        weights_actor(composite(**heads), **heads, logits_std=0.2, frozen=frozen)
+
+
+@pytest.mark.parametrize("std", [0.0, -0.2, float("nan")])
+def test_exploration_over_weights_refuses_an_impossible_standard_deviation(std, composite):
+    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+    with pytest.raises(ValueError, match="logits_std"):
+        weights_actor(composite(**heads), **heads, logits_std=std, frozen=["primitives"])

@@ -1,0 +1,104 @@
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp.runs import build
+from torchrl_mcp.runs import builtin
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.runs import experiment
+
+SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
+BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
+
+
+def configure(folder, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", [*SMOKE, f"run_dir={folder}", *overrides])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A walker's first steps."""
+    return experiment.train(configure(tmp_path_factory.mktemp("walker") / "run", *BIPED, "motions=single"))
+
+
+@pytest.fixture(scope="module")
+def published(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("published") / "mcp-biped.torchrl"
+    experiment.publish_run(run, path)
+    return path
+
+
+def act(path):
+    """Actions of a checkpoint's policy in the same three states."""
+    _, agent, _ = experiment.restore(path, num_envs=1, seed=0)
+    generator = torch.Generator().manual_seed(0)
+    states = {key: torch.randn(3, size, generator=generator) for key, size in (("observation", 105), ("goal", 208))}
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return agent.actor.policy(TensorDict(states, [3]))["action"]
+
+
+def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16(run, published):
+    torch.testing.assert_close(act(published), act(run), atol=0.02, rtol=0)
+    assert (act(published) != act(run)).any()
+
+
+def test_a_published_policy_is_a_small_part_of_the_checkpoint_and_names_no_folder(run, published):
+    assert published.stat().st_size < checkpoint.find(run).stat().st_size / 8
+    assert str(run.parent) not in str(checkpoint.configuration(published))
+
+
+def test_primitives_are_transferred_from_what_comes_with_the_library(run, published, tmp_path, monkeypatch):
+    monkeypatch.setattr(builtin, "FOLDER", published.parent)
+    transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
+    folder = experiment.train(configure(tmp_path / "run", *transfer, "training.total_frames=128"))
+    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, original, _ = experiment.restore(run, num_envs=1, seed=0)
+    for name, parameter in agent.parts["primitives"].state_dict().items():
+        assert torch.equal(parameter, original.parts["primitives"].state_dict()[name].bfloat16().float())
+
+
+def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
+    settings = [*BIPED, "motions=turning", "training.total_frames=128"]
+    for origin, missing in ((checkpoint.find(run), set()), (published, {"critic"})):
+        cfg = configure(tmp_path / "run", *settings, f"pretrained={origin}")
+        env = build.make_env(cfg, num_envs=1, seed=0)
+        assert len(env.library) == 7
+        agent, other = build.make_agent(cfg, env, origin), experiment.restore(origin, num_envs=1, seed=0)[1]
+        for name in set(agent.parts) - missing:
+            assert parameters(agent.parts[name]) == parameters(other.parts[name])
+    folder = experiment.train(cfg)
+    assert checkpoint.find(folder).is_file()
+
+
+def parameters(part):
+    return {name: value.tolist() for name, value in part.state_dict().items()}
+
+
+def test_what_does_not_come_with_the_library_is_named(published, tmp_path, monkeypatch):
+    monkeypatch.setattr(builtin, "FOLDER", published.parent)
+    cfg = configure(tmp_path / "run", "method=mcp", "character=trex", "task=heading", "stage=transfer")
+    cfg.pretrained = "builtin"
+    with pytest.raises(ValueError, match=r"no network for method=mcp and character=trex .* only mcp-biped"):
+        experiment.train(cfg)
+
+
+def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
+    assert builtin.locate(str(tmp_path)) == tmp_path
+    assert builtin.locate("builtin:biped") == builtin.FOLDER / "mcp-biped.torchrl"
+    with pytest.raises(ValueError, match="character=dog comes with the library, only mcp-biped, mcp-humanoid"):
+        builtin.locate("builtin:dog")
+
+
+@pytest.mark.parametrize("path", sorted(builtin.FOLDER.glob("*.torchrl")), ids=lambda path: path.stem)
+def test_what_comes_with_the_library_follows_its_motions(path):
+    results = experiment.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
+    assert results["deterministic"]["terminated"] <= 0.25
+    assert results["deterministic"]["measures"]["tracking_error"] < 0.15

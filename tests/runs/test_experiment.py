@@ -1,0 +1,231 @@
+"""The command line: what it runs, what it refuses and what it says instead."""
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from torchrl_mcp import conf
+from torchrl_mcp.cli import evaluate
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.cli import train
+
+FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
+CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
+
+
+def command(name, *arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", f"torchrl_mcp.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
+    )
+
+
+def configure(*overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", overrides=list(overrides))
+
+
+def contents(folder):
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    assert command("train", *FAST, "task.pretrain.max_episode_steps=100", cwd=folder).returncode == 0
+    return folder / "runs/holdout-ant/pretrain/mcp/preset-smoke_task.pretrain.max_episode_steps-100/seed0"
+
+
+def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run):
+    root = run.parents[5]
+    assert {path.name for path in root.iterdir()} == {"runs"}
+    assert {path.name for path in run.iterdir()} == {"config.yaml", "origin.json", "metrics.csv", "checkpoints"}
+    assert OmegaConf.load(run / "config.yaml").method.name == "mcp"
+    origin = json.loads((run / "origin.json").read_text())
+    assert origin["command"] == ["torchrl-mcp-train", *FAST, "task.pretrain.max_episode_steps=100"]
+    assert origin["choices"]["preset"] == "smoke"
+    assert "hydra/launcher" not in origin["choices"]
+
+
+def test_a_multirun_makes_a_folder_per_job(tmp_path):
+    outcome = command("train", "-m", *FAST, "mixer=multiplicative,additive", "training.total_frames=128", cwd=tmp_path)
+    assert outcome.returncode == 0, outcome.stderr
+    assert len(list(tmp_path.rglob("metrics.csv"))) == 2
+
+
+def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run, tmp_path):
+    outcome = command("evaluate", run, "--episodes", 100, "--output", tmp_path / "numbers.json", cwd=tmp_path)
+    assert outcome.returncode == 0, outcome.stderr
+    numbers = json.loads((tmp_path / "numbers.json").read_text())
+    for mode in ("deterministic", "stochastic"):
+        assert numbers[mode]["episodes"] == 100
+        assert f"normalised return {numbers[mode]['normalised_return']:.3f}" in outcome.stdout
+        # Holdout normalises by 6 per step, here over 100 steps.
+        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / 600, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        (["num_primitve=4"], "num_primitives"),
+        (["stage.gama=0.9"], "stage.gamma"),
+        (["task=holdot"], "holdout"),
+        (["method=mpc"], "mcp"),
+        (["stage=transfer"], "pretrained=<folder>"),
+        (["stage=transfer", "pretrained=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
+        (["exploration=weights"], "stage=transfer"),
+        (
+            ["resume=nowhere", "device=cuda"],
+            "leave out preset=smoke logger=none num_threads=1 progress_bar=false device=cuda",
+        ),
+        (["training.minibatch_size=100"], "multiple"),
+        (["num_primitives=0"], "num_primitives must be at least 1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_is_answered_with_what_to_write_instead(tmp_path, arguments, remedy):
+    outcome = command("train", *FAST, *arguments, cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert remedy in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(run):
+    before = contents(run)
+    outcome = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
+    assert outcome.returncode != 0
+    assert "resume=" in outcome.stderr
+    assert contents(run) == before
+
+
+def test_transfer_from_another_architecture_is_refused(run, tmp_path):
+    outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "different method, character, task or network size" in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def flip_a_byte(data):
+    return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 0xFF]) + data[len(data) // 2 + 1 :]
+
+
+@pytest.mark.parametrize("damage", [flip_a_byte, lambda data: data[:1000], lambda data: b"something else"])
+def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path, damage):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    newest = max((copy / "checkpoints").iterdir())
+    newest.write_bytes(damage(newest.read_bytes()))
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.training.total_frames *= 2  # there is something left to do
+    OmegaConf.save(cfg, copy / "config.yaml")
+    before = contents(copy)
+    outcome = command("train", f"resume={copy}", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "damaged" in outcome.stderr
+    assert contents(copy) == before
+
+
+def test_a_resume_of_no_run_says_what_is_missing(tmp_path):
+    outcome = command("train", "resume=nowhere", cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert "nowhere holds no run" in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_complete_run_is_left_as_it_is_and_said_to_be_complete(run, monkeypatch, capsys):
+    before = contents(run)
+    monkeypatch.setattr(sys, "argv", ["train", f"resume={run}"])
+    train.main()
+    assert f"{run} is complete: nothing is left to do" in capsys.readouterr().out
+    assert contents(run) == before
+
+
+@pytest.fixture(scope="module")
+def evaluated(run, tmp_path_factory):
+    """The run, resumed after its configuration asked for an evaluation."""
+    copy = tmp_path_factory.mktemp("evaluated") / "run"
+    shutil.copytree(run, copy)
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.evaluation.episodes = 3
+    OmegaConf.save(cfg, copy / "config.yaml")
+    assert not experiment.is_complete(copy)
+    experiment.resume(copy)
+    return copy
+
+
+def test_training_ends_with_an_evaluation_also_after_a_resume(evaluated):
+    assert experiment.is_complete(evaluated)
+    written = json.loads((evaluated / "evaluation.json").read_text())
+    assert (written["episodes"], written["seed"], written["environment"]) == (3, 12345, {})
+    for mode in ("deterministic", "stochastic"):
+        assert written[mode]["episodes"] == 3
+        assert "gates/entropy" in written[mode]["diagnostics"]
+
+
+def test_the_evaluate_command_writes_what_training_writes(evaluated, monkeypatch, capsys):
+    written = (evaluated / "evaluation.json").read_text()
+    output = evaluated / "again.json"
+    monkeypatch.setattr(sys, "argv", ["evaluate", str(evaluated), "--episodes", "3", "--output", str(output)])
+    evaluate.main()
+    assert output.read_text() == written
+
+
+def test_a_run_that_is_to_go_on_loses_its_evaluation_and_gets_another(evaluated, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(evaluated, copy)
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.training.total_frames *= 2
+    OmegaConf.save(cfg, copy / "config.yaml")
+    assert not experiment.is_complete(copy)
+    experiment.resume(copy)
+    assert experiment.is_complete(copy)
+    assert (copy / "evaluation.json").read_text() != (evaluated / "evaluation.json").read_text()
+
+
+def test_a_run_of_before_there_were_evaluations_is_evaluated_as_a_new_one(evaluated, tmp_path):
+    cfg = OmegaConf.load(evaluated / "config.yaml")
+    del cfg["evaluation"]
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    usual = {"episodes": 128, "seed": 12345, "environment": {}}
+    assert experiment.configuration(tmp_path).evaluation == usual
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):  # as on the command line
+        assert experiment.configuration(tmp_path).evaluation == usual
+
+
+def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():
+    for method in ("mcp", "finetune", "hierarchical"):
+        evaluation = configure("task=imitation", "character=biped", f"method={method}", "preset=fast").evaluation
+        assert OmegaConf.to_container(evaluation, resolve=True) == {
+            "episodes": 128,
+            "seed": 12345,
+            "environment": {"clip_end": "switch", "switch_interval": 5.0},
+        }
+
+
+@pytest.mark.parametrize(("method", "stage", "step_size"), [("mcp", "pretrain", 2e-5), ("mcp", "transfer", 5e-5)])
+def test_the_paper_preset_holds_table_5(method, stage, step_size):
+    cfg = configure("preset=paper", f"method={method}", f"stage={stage}")
+    assert cfg.num_primitives == 8
+    assert cfg.optimizer.actor["_target_"] == cfg.optimizer.critic["_target_"] == "torch.optim.SGD"
+    assert cfg.optimizer.actor.lr == step_size
+    assert cfg.optimizer.critic.lr == 1e-2
+    assert cfg.optimizer.actor.momentum == cfg.optimizer.critic.momentum == 0.9
+    assert cfg.training.frames_per_batch == 4096
+    assert cfg.training.minibatch_size == 256
+    assert cfg.objective.advantages.lmbda == 0.95
+    assert cfg.objective.advantages.gamma == {"pretrain": 0.95, "transfer": 0.99}[stage]
+    assert cfg.objective.loss.clip_epsilon == 0.02
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: "/".join(path.parts[-2:]))
+def test_every_configuration_file_is_short_and_says_what_it_is(path):
+    lines = path.read_text().splitlines()
+    assert any(line.startswith("# ") and not line.startswith("# @package") for line in lines[:2])
+    assert path.name == "train.yaml" or len(lines) <= 20

@@ -1,0 +1,73 @@
+import json
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from torchrl_mcp import __version__
+from torchrl_mcp.runs import provenance
+
+
+def git(folder, *arguments):
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    return subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    if shutil.which("git") is None:
+        pytest.skip("needs git")
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "code.py").write_text("1\n")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", "package/code.py")
+    git(tmp_path, "commit", "-q", "-m", "one")
+    return tmp_path
+
+
+def test_the_commit_is_that_of_the_checkout_and_says_whether_files_were_changed_since(checkout):
+    head = git(checkout, "rev-parse", "HEAD").strip()
+    commit = provenance.commit(checkout / "package")
+    assert len(commit) >= 7
+    assert head.startswith(commit)
+    (checkout / "package" / "code.py").write_text("2\n")
+    assert provenance.commit(checkout / "package") == f"{commit}-dirty"
+
+
+def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tmp_path_factory):
+    installed = checkout / ".venv" / "package"
+    installed.mkdir(parents=True)
+    (installed / "code.py").touch()
+    assert provenance.commit(installed) is None
+    assert provenance.commit(tmp_path_factory.mktemp("elsewhere")) is None
+
+
+def test_the_origin_names_command_code_time_and_machine(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
+    content = json.loads(json.dumps(provenance.origin("cpu")))
+    assert content["command"] == ["script.py", "seed=3"]
+    assert content["version"] == __version__
+    assert abs((datetime.now(UTC) - datetime.fromisoformat(content["started"])).total_seconds()) < 60
+    assert content["machine"]["torch"] == torch.__version__
+    assert content["machine"]["device"] == "cpu"
+    assert content["machine"]["cores"] >= 1
+    assert content["machine"]["processor"]
+
+
+def test_within_hydra_command_and_choices_are_those_of_the_job(monkeypatch):
+    hydra = OmegaConf.create(
+        {
+            "overrides": {"task": ["preset=fast", "seed=1"]},
+            "runtime": {"choices": {"preset": "fast", "hydra/launcher": "basic", "benchmark": None}},
+        }
+    )
+    monkeypatch.setattr(provenance.HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(provenance.HydraConfig, "get", lambda: hydra)
+    content = json.loads(json.dumps(provenance.origin("cpu")))
+    assert content["command"] == ["torchrl-mcp-train", "preset=fast", "seed=1"]
+    assert content["choices"] == {"preset": "fast"}

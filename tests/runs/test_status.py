@@ -1,0 +1,100 @@
+import fcntl
+import io
+import json
+import sys
+
+import pytest
+from rich.console import Console
+
+from torchrl_mcp.runs import status
+from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
+
+HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
+
+
+def make_run(folder, *, frames=0, total=1000, log=True, evaluation=None, episodes=None):
+    folder.mkdir(parents=True)
+    settings = "" if episodes is None else f"evaluation: {{episodes: {episodes}}}\n"
+    (folder / "config.yaml").write_text(f"training: {{total_frames: {total}}}\n{settings}")
+    if frames:
+        (folder / "metrics.csv").write_text(HEADER + f"1,100,1.0,0.1,99.0\n2,{frames},2.0,0.25,50.0\n")
+    if log:
+        (folder / "train.log").touch()
+    if evaluation is not None:
+        content = {"deterministic": {"normalised_return": evaluation}}
+        (folder / "evaluation.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """A run of each state, the running one locked as by a process that trains it."""
+    make_run(tmp_path / "finished", frames=1000, evaluation=0.75)
+    make_run(tmp_path / "killed", frames=600)
+    alive = make_run(tmp_path / "alive", frames=400)
+    planned = {tmp_path / name: 1000 for name in ("finished", "killed", "alive", "later")}
+    write_manifest(planned, tmp_path / "multirun" / "benchmark-x.json")
+    with (alive / "train.log").open() as log:
+        fcntl.flock(log, fcntl.LOCK_EX)
+        yield tmp_path
+
+
+def test_a_run_is_waiting_running_stopped_or_done(runs):
+    states = {one.folder.name: one.state for one in look(runs)}
+    assert states == {"finished": "done", "killed": "stopped", "alive": "running", "later": "waiting"}
+
+
+def test_a_run_that_is_running_has_a_speed_and_an_end(runs):
+    one = status(runs / "alive")
+    assert (one.frames, one.total, one.speed, one.normalised_return) == (400, 1000, 50.0, 0.25)
+    assert one.remaining == pytest.approx((1000 - 400) / 50)
+
+
+def test_the_return_is_that_of_the_evaluation_once_there_is_one(runs):
+    assert status(runs / "finished").normalised_return == 0.75
+    assert status(runs / "finished").remaining is None
+
+
+def test_a_run_is_done_after_its_steps_unless_an_evaluation_is_to_follow(tmp_path):
+    assert status(make_run(tmp_path / "old", frames=1000, log=False)).state == "done"
+    assert status(make_run(tmp_path / "none", frames=1000, episodes=0)).state == "done"
+    assert status(make_run(tmp_path / "died", frames=1000, episodes=128)).state == "stopped"
+
+
+def test_a_row_that_is_being_written_is_not_read(runs):
+    with (runs / "alive" / "metrics.csv").open("a") as file:
+        file.write("3,600,3.0,0.")
+    assert status(runs / "alive").frames == 400
+
+
+def test_the_table_shows_what_runs_first_and_counts_what_it_leaves_out(runs):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table(look(runs), runs, height=2))
+    lines = console.file.getvalue().splitlines()
+    assert lines[1].split() == ["alive", "running", "400/1,000", "50", "0.250", "0", "min"]
+    assert lines[2].split()[:2] == ["killed", "stopped"]
+    assert "1 running, 1 stopped, 1 done, 1 waiting; 2 not shown" in lines[3]
+
+
+def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkeypatch):
+    monkeypatch.setattr(status, "INTERVAL", 0.01)
+    with overview(runs, {runs / name: 1000 for name in ("alive", "later")}):
+        make_run(runs / "later", frames=1000, evaluation=0.5)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1:3] for line in lines] in (
+        [["running", "alive"], ["done", "later"]],
+        [["done", "later"], ["running", "alive"]],
+    )
+    assert lines[-1].endswith("(1 running, 1 done)")
+
+
+def test_the_command_shows_a_folder(runs, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", str(runs)])
+    status.main()
+    assert "1 running, 1 stopped, 1 done, 1 waiting" in capsys.readouterr().out
+
+
+def test_a_folder_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", "nowhere"])
+    with pytest.raises(SystemExit, match="no folder nowhere"):
+        status.main()

@@ -1,0 +1,121 @@
+"""Collection in workers: the same as in this process, but elsewhere."""
+
+import csv
+import subprocess
+import sys
+from functools import partial
+from importlib.util import find_spec
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from torchrl_mcp.envs import Holdout
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training import checkpoint, collectors
+from torchrl_mcp.training.collectors import RemoteSource
+from torchrl_mcp.training.progress import Stopwatch
+
+SMOKE = ["preset=smoke", "logger=none", "progress_bar=false"]
+ONE_STEP = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=384"]
+BACKENDS = [
+    "processes",
+    pytest.param("ray", marks=pytest.mark.skipif(not find_spec("ray"), reason="needs pip install 'torchrl-mcp[ray]'")),
+]
+
+
+@pytest.fixture(autouse=True)
+def private_ray(monkeypatch):
+    """Keep Ray from writing into the home and from calling home."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+
+
+def configure(folder, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", overrides=[*SMOKE, f"run_dir={folder}", *overrides])
+
+
+def rows(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(row):
+    return {key: value for key, value in row.items() if not key.startswith(("seconds", "time/"))}
+
+
+def restored(folder):
+    """The trainer of a run, at its newest checkpoint."""
+    cfg = experiment.configuration(folder)
+    source = build.make_source(cfg)
+    trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, folder)
+    trainer.restore(checkpoint.find(folder))
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return experiment.train(configure(tmp_path_factory.mktemp("run"), "collector=processes", *ONE_STEP))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_workers_act_by_the_newest_weights_and_statistics_in_every_batch(run, tmp_path, backend):
+    folder = run if backend == "processes" else tmp_path
+    if backend == "ray":  # whose start forks, which a large process may not
+        arguments = [*SMOKE, f"run_dir={folder}", "collector=ray", *ONE_STEP]
+        subprocess.run([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], check=True)
+    assert len(rows(folder)) == 3
+    for row in rows(folder):  # one gradient step per batch: its samples are of the policy that it changes
+        assert float(row["loss/kl"]) == pytest.approx(0, abs=1e-6)
+        assert float(row["loss/max_ratio"]) == pytest.approx(1, abs=1e-5)
+        assert float(row["loss/ESS"]) == pytest.approx(1, abs=1e-5)
+        assert 0 < float(row["time/collection"]) < 1
+        assert float(row["time/steps_per_second"]) > 0
+    assert [numbers(row) for row in rows(folder)] == [numbers(row) for row in rows(run)]
+
+
+def test_the_noise_of_latents_comes_back_from_workers(tmp_path):
+    experiment.train(configure(tmp_path, "collector=processes", "method=latent_space", "autocast=false", *ONE_STEP))
+    for row in rows(tmp_path):
+        assert float(row["loss/kl"]) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path):
+    cfg = configure(tmp_path, "collector=processes", "checkpoint_interval=1", *ONE_STEP)
+    cfg.training.total_frames = 128
+    experiment.train(cfg)
+    path = tmp_path / "config.yaml"
+    path.write_text(path.read_text().replace("total_frames: 128", "total_frames: 384"))
+    experiment.resume(tmp_path)
+    resumed, whole = rows(tmp_path), rows(run)
+    assert not restored(tmp_path).episodes.lengths.any()  # of episodes that no one goes on with
+    assert numbers(resumed[0]) == numbers(whole[0])
+    assert [row["frames"] for row in resumed] == ["128", "256", "384"]
+    assert resumed[1]["reward"] != whole[1]["reward"]
+
+
+def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):
+    cfg = configure(tmp_path, "method=option_critic")
+    source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2)
+    policy, watch = build.make_agent(cfg, source.env).actor.policy, Stopwatch()
+    source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=False, stopwatch=watch)
+    batch = source.collect()
+    source.stop()
+    assert batch.shape == (4, 20)
+    for key in ("observation", "action"):
+        assert len(batch[key][:, 0].unique(dim=0)) == 4
+    assert batch["option"].unique().numel() > 2
+    assert batch["held_option"][:, 1:].equal(batch["option"][:, :-1])
+    assert watch.seconds["collection"] > 0
+
+
+def test_environments_that_do_not_divide_evenly_are_refused():
+    with pytest.raises(ValueError, match="num_envs=5 must be a multiple of num_workers=2"):
+        RemoteSource(Holdout, num_envs=5, seed=0, num_workers=2)
+
+
+def test_a_missing_ray_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setattr(collectors, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'torchrl-mcp\[ray\]'"):
+        RemoteSource(Holdout, num_envs=4, seed=0, num_workers=2, backend="ray")

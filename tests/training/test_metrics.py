@@ -1,0 +1,119 @@
+import csv
+import math
+
+import pytest
+
+from torchrl_mcp.training.metrics import MetricsWriter
+
+
+class Recorder:
+    """Stands in for a TorchRL logger."""
+
+    def __init__(self):
+        self.calls = []
+
+    def log_metrics(self, metrics, step=None):
+        self.calls.append((metrics, step))
+
+
+def table(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def fill(folder, iterations):
+    record = MetricsWriter(folder)
+    for i in iterations:
+        record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+    return record
+
+
+def test_every_row_has_the_names_of_the_first(tmp_path):
+    record = MetricsWriter(tmp_path)
+    record.write({"iteration": 1, "loss": 0.1}, step=100)
+    record.write({"loss": math.nan, "iteration": 2}, step=200)
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,loss", "1,0.1", "2,nan"]
+    with pytest.raises(ValueError, match="surprise"):
+        record.write({"iteration": 3, "loss": 0.1, "surprise": 1.0}, step=300)
+
+
+def test_numbers_survive_the_file_to_the_bit(tmp_path):
+    numbers = {"iteration": 1, "third": 1 / 3, "tiny": 5e-324, "large": 1.7976931348623157e308, "infinite": math.inf}
+    MetricsWriter(tmp_path).write(numbers, step=1)
+    assert {name: float(value) for name, value in table(tmp_path)[0].items()} == numbers
+
+
+def test_loggers_get_every_metric_that_is_a_number(tmp_path):
+    loggers = [Recorder(), Recorder()]
+    record = MetricsWriter(tmp_path, loggers)
+    record.write({"iteration": 1, "return": math.nan, "loss": 0.1}, step=100)
+    record.write({"iteration": 2, "return": 7.0, "loss": math.inf}, step=200)
+    for logger in loggers:
+        assert logger.calls == [
+            ({"iteration": 1, "loss": 0.1}, 100),
+            ({"iteration": 2, "return": 7.0, "loss": math.inf}, 200),
+        ]
+
+
+def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
+    fill(tmp_path, range(1, 13))
+    before = table(tmp_path)
+    record = MetricsWriter(tmp_path)
+    record.rewind(10)
+    assert table(tmp_path) == before[:10]
+    record.write({"iteration": 11, "frames": 1, "loss": 2.0}, step=1)
+    assert table(tmp_path) == [*before[:10], {"iteration": "11", "frames": "1", "loss": "2.0"}]
+
+
+def test_wherever_a_kill_cuts_the_file_a_continued_run_writes_a_whole_one(tmp_path):
+    fill(tmp_path, [8, 9, 10, 11])
+    file = tmp_path / "metrics.csv"
+    whole, expected = file.read_bytes(), table(tmp_path)
+    safe = whole.index(b"10,1000")  # the checkpoint of iteration 9 is younger than its row
+    for cut in range(safe, len(whole)):
+        file.write_bytes(whole[:cut])
+        record = MetricsWriter(tmp_path)
+        record.rewind(9)
+        assert table(tmp_path) == expected[:2], cut
+        for i in (10, 11):
+            record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+        assert table(tmp_path) == expected, cut
+        assert file.read_bytes() == whole, cut
+
+
+def test_a_kill_while_rewinding_loses_no_row(tmp_path, monkeypatch):
+    fill(tmp_path, range(1, 13))
+    before = table(tmp_path)
+
+    def killed(self, rows):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("csv.DictWriter.writerows", killed)
+        with pytest.raises(KeyboardInterrupt):
+            MetricsWriter(tmp_path).rewind(10)
+    assert table(tmp_path) == before
+    MetricsWriter(tmp_path).rewind(10)
+    assert table(tmp_path) == before[:10]
+    assert [file.name for file in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+def test_a_header_that_a_kill_cut_short_is_written_anew(tmp_path):
+    fill(tmp_path, [1, 2])
+    file = tmp_path / "metrics.csv"
+    whole = file.read_bytes()
+    for cut in range(whole.index(b"1,100")):
+        file.write_bytes(whole[:cut])
+        record = MetricsWriter(tmp_path)
+        record.rewind(0)
+        for i in (1, 2):
+            record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+        assert file.read_bytes() == whole, cut
+
+
+def test_rewinding_before_anything_was_written_does_nothing(tmp_path):
+    record = MetricsWriter(tmp_path)
+    record.rewind(5)
+    assert not (tmp_path / "metrics.csv").exists()
+    record.write({"iteration": 1}, step=1)
+    assert table(tmp_path) == [{"iteration": "1"}]

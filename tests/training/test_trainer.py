@@ -1,0 +1,176 @@
+"""The loop as a whole: it learns, it stops in time, it continues to the same numbers."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training.trainer import Trainer, checkpoint
+
+TIMES = ("seconds", "time/")
+
+
+def configure(folder, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
+        return compose("train", overrides=[*settings, *overrides])
+
+
+def rows(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if not k.startswith(TIMES)} for row in csv.DictReader(file)]
+
+
+def final_parts(folder):
+    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    return agent.parts.state_dict()
+
+
+@pytest.fixture(scope="module")
+def pretrained(tmp_path_factory):
+    return experiment.train(configure(tmp_path_factory.mktemp("runs") / "mcp"))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [[], ["method=scratch"], ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"]],
+    ids=" ".join,
+)
+def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path, overrides):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    settings = [*overrides, "checkpoint_interval=1", "training.total_frames=768"]
+    experiment.train(configure(whole, *settings))
+
+    arguments = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={killed}", *settings]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    deadline = time.monotonic() + 60
+    while not (killed / "metrics.csv").exists() or len(rows(killed)) < 2:
+        assert run.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    assert len(rows(killed)) < 6
+
+    experiment.resume(killed)
+    assert rows(killed) == rows(whole)
+    expected = final_parts(whole)
+    for name, value in final_parts(killed).items():
+        assert torch.equal(value, expected[name]), name
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pretrained):
+    experiment.train(configure(tmp_path / "same"))
+    experiment.train(configure(tmp_path / "other", "seed=1"))
+    assert rows(tmp_path / "same") == rows(pretrained)
+    assert rows(tmp_path / "other") != rows(pretrained)
+
+
+@pytest.mark.parametrize("exploration", ["action", "weights"])
+def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path, pretrained, exploration):
+    folder = tmp_path / exploration
+    experiment.train(configure(folder, "stage=transfer", f"exploration={exploration}", f"pretrained={pretrained}"))
+    before, after = final_parts(pretrained), final_parts(folder)
+    for name in before:
+        kept = name.startswith(("primitives", "observation_normaliser"))
+        constant = (
+            name.endswith("count") and "critic" not in name and "goal" in name
+        )  # the same number of goals was seen
+        assert torch.equal(before[name], after[name]) == (kept or constant), name
+
+
+def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, pretrained):
+    settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]"]
+    start = build.make_agent(
+        cfg := configure(tmp_path / "run", *settings),
+        build.make_env(cfg, num_envs=1, seed=0),
+        checkpoint.find(pretrained),
+    )
+    before = final_parts(pretrained)
+    for name, value in start.parts["primitives"].state_dict().items():
+        assert torch.equal(value, before[f"primitives.{name}"])
+    experiment.train(cfg)
+    after = final_parts(tmp_path / "run")
+    assert not torch.equal(before["primitives.output.weight"], after["primitives.output.weight"])
+
+
+@pytest.mark.parametrize(("autocast", "tolerance"), [("false", 1e-5), ("true", 2e-3)])
+@pytest.mark.parametrize("method", ["method=mcp", "mixer=additive", "method=scratch"])
+def test_collection_and_loss_agree_before_the_first_update(tmp_path, method, autocast, tolerance):
+    # One gradient step per iteration: its report is from before the step. Matrix products of other batch sizes round
+    # differently, in bfloat16 more than in float32.
+    folder = tmp_path / "run"
+    one_step = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=128"]
+    experiment.train(configure(folder, method, f"autocast={autocast}", *one_step))
+    (first,) = rows(folder)
+    assert float(first["loss/clip_fraction"]) == 0.0
+    assert abs(float(first["loss/max_ratio"]) - 1.0) <= tolerance
+    assert abs(float(first["loss/kl"])) <= tolerance
+
+
+def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_good_checkpoint(tmp_path):
+    folder = tmp_path / "run"
+    cfg = configure(folder, "checkpoint_interval=1", "optimizer.critic.lr=1e30", "objective.max_grad_norm=1e30")
+    with pytest.raises(FloatingPointError, match=r"loss_critic|critic_grad_norm"):
+        experiment.train(cfg)
+    for value in final_parts(folder).values():
+        assert value.isfinite().all()
+
+
+def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypatch):
+    cfg = configure(tmp_path / "run", "stage=transfer", f"pretrained={pretrained}")
+    real = Trainer._update_normalisers
+
+    def meddle(trainer, batch):
+        real(trainer, batch)
+        trainer.parts["primitives"].output.bias.data[0, 0] += 1e-6
+
+    monkeypatch.setattr(Trainer, "_update_normalisers", meddle)
+    with pytest.raises(RuntimeError, match="primitives"):
+        experiment.train(cfg)
+
+
+def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all(tmp_path, monkeypatch):
+    threads = {"step": set(), "update": set()}
+
+    def watch(section, method):
+        def watched(*args):
+            threads[section].add(torch.get_num_threads())
+            return method(*args)
+
+        return watched
+
+    monkeypatch.setattr(CharacterEnv, "_step", watch("step", CharacterEnv._step))
+    monkeypatch.setattr(Trainer, "_update", watch("update", Trainer._update))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        experiment.train(configure(tmp_path))
+    finally:
+        torch.set_num_threads(before)
+    assert threads == {"step": {1}, "update": {2}}
+
+
+def test_the_shares_of_time_add_up_to_the_whole(pretrained):
+    with (pretrained / "metrics.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            shares = {key: float(value) for key, value in row.items() if key.startswith("time/") and "steps" not in key}
+            assert set(shares) == {"time/physics", "time/forward", "time/update", "time/other"}
+            assert all(share > 0 for share in shares.values())
+            assert sum(shares.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_the_learner_runs_on_a_gpu_beside_physics_on_the_cpu(tmp_path):
+    experiment.train(configure(tmp_path / "run", "device=cuda"))
+    assert all(value.isfinite().all() for value in final_parts(tmp_path / "run").values())

@@ -1,0 +1,123 @@
+import pytest
+import torch
+from torch import nn
+
+from torchrl_mcp.modules import RunningNormaliser
+from torchrl_mcp.training.transfer import FrozenParts, fingerprint, require_parts
+
+
+def make():
+    torch.manual_seed(0)
+    return nn.ModuleDict(
+        {"primitives": nn.Linear(2, 1), "gating": nn.Linear(3, 1), "observation_normaliser": RunningNormaliser(2)}
+    )
+
+
+def bits(tensor):
+    """The memory of ``tensor`` as integers."""
+    return tensor.data.view({4: torch.int32, 8: torch.int64}[tensor.element_size()]).view(-1)
+
+
+def flip(tensor, bit, index=0):
+    bits(tensor)[index] ^= torch.tensor(1, dtype=bits(tensor).dtype) << bit
+
+
+def test_frozen_parts_require_no_gradient_and_the_others_still_do():
+    parts = make()
+    frozen = FrozenParts(parts, ["primitives"])
+    assert not any(parameter.requires_grad for parameter in parts["primitives"].parameters())
+    assert all(parameter.requires_grad for parameter in parts["gating"].parameters())
+    assert "primitives" in frozen
+    assert "gating" not in frozen
+
+
+def test_untouched_parts_pass_while_the_others_train():
+    parts = make()
+    frozen = FrozenParts(parts, ["primitives", "observation_normaliser"])
+    with torch.no_grad():
+        parts["gating"].weight += 1
+    parts["observation_normaliser"](torch.randn(5, 2))
+    frozen.verify()
+
+
+@pytest.mark.parametrize("bit", [0, 13, 31])
+@pytest.mark.parametrize(
+    ("part", "tensor"),
+    [
+        ("primitives", "weight"),
+        ("primitives", "bias"),
+        ("observation_normaliser", "mean"),
+        ("observation_normaliser", "variance"),
+        ("observation_normaliser", "count"),
+    ],
+)
+def test_one_changed_bit_of_a_parameter_or_buffer_is_noticed(part, tensor, bit):
+    parts = make()
+    frozen = FrozenParts(parts, ["primitives", "observation_normaliser"])
+    target = parts[part].state_dict()[tensor]
+    flip(target, bit)
+    with pytest.raises(RuntimeError, match=part):
+        frozen.verify()
+    flip(target, bit)
+    frozen.verify()
+
+
+def test_a_normaliser_that_keeps_learning_is_noticed():
+    parts = make()
+    frozen = FrozenParts(parts, ["observation_normaliser"])
+    parts["observation_normaliser"].update(torch.randn(5, 2))
+    with pytest.raises(RuntimeError, match="observation_normaliser"):
+        frozen.verify()
+
+
+def test_its_state_holds_a_continued_run_to_the_parts_it_began_with():
+    parts = make()
+    state = FrozenParts(parts, ["primitives"]).state_dict()
+    with torch.no_grad():
+        parts["primitives"].weight += 1
+    continued = FrozenParts(parts, ["primitives"])
+    continued.verify()
+    continued.load_state_dict(state)
+    with pytest.raises(RuntimeError, match="primitives"):
+        continued.verify()
+
+
+def test_freezing_nothing_is_allowed():
+    parts = make()
+    FrozenParts(parts, []).verify()
+    assert all(parameter.requires_grad for parameter in parts.parameters())
+
+
+def test_an_unknown_part_is_refused_and_the_known_ones_are_named():
+    with pytest.raises(ValueError, match=r"transfer\.freeze.*'primitive'.*'gating'.*'primitives'"):
+        FrozenParts(make(), ["primitive", "gating"])
+    with pytest.raises(ValueError, match=r"transfer\.keep.*\['critic', 'primitive'\]"):
+        require_parts(make(), ["primitive", "gating", "critic"], "transfer.keep")
+    require_parts(make(), ["gating", "primitives"], "transfer.keep")
+
+
+def test_the_fingerprint_depends_on_every_bit():
+    module = nn.Sequential(nn.Linear(2, 1), RunningNormaliser(1))
+    seen = {fingerprint(module)}
+    num_bits = 0
+    for tensor in module.state_dict().values():
+        for index in range(tensor.numel()):
+            for bit in range(8 * tensor.element_size()):
+                flip(tensor, bit, index)
+                seen.add(fingerprint(module))
+                flip(tensor, bit, index)
+                num_bits += 1
+    # Three numbers of the layer, mean and variance of 32 bits each; the count has 64.
+    assert num_bits == 5 * 32 + 64
+    assert len(seen) == num_bits + 1
+
+
+def test_the_fingerprint_depends_on_names_and_on_nothing_else():
+    torch.manual_seed(0)
+    layer = nn.Linear(2, 2)
+    assert fingerprint(nn.ModuleDict({"a": layer})) != fingerprint(nn.ModuleDict({"b": layer}))
+    twin = nn.Linear(2, 2)
+    assert fingerprint(layer) != fingerprint(twin)
+    twin.load_state_dict(layer.state_dict())
+    assert fingerprint(layer) == fingerprint(twin)
+    assert fingerprint(layer) == fingerprint(twin.requires_grad_(False).eval())

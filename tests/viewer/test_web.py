@@ -1,0 +1,112 @@
+import contextlib
+import socket
+import threading
+import time
+from types import SimpleNamespace
+from urllib.error import URLError
+from urllib.request import urlopen
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as MuJoCo 3.17 has it")
+
+from torchrl_mcp.envs import Heading
+from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.viewer.web import Pace, Stage, play_in_browser
+
+IDLE = TensorDictModule(lambda goal: torch.zeros(len(goal), 17), in_keys=["goal"], out_keys=["action"])
+
+
+class Stop(Exception):
+    pass
+
+
+class Brief(Player):
+    """Stops the show when told to."""
+
+    def __init__(self):
+        super().__init__(IDLE, Heading("biped", 1, seed=0, num_threads=1))
+        self.over, self.steps = threading.Event(), 0
+
+    def step(self):
+        if self.over.is_set():
+            raise Stop
+        super().step()
+        self.steps += 1
+
+
+@contextlib.contextmanager
+def shown(player):
+    """The address of a page that shows what a player does."""
+    with socket.socket() as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+
+    def run():
+        with contextlib.suppress(Stop):
+            play_in_browser(player, port=port)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield f"http://localhost:{port}"
+    finally:
+        player.over.set()
+        thread.join(10)
+    assert not thread.is_alive()
+
+
+def fetched(address, seconds=20):
+    """What is at an address that answers sooner or later."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            with urlopen(address, timeout=5) as answer:
+                return answer.read()
+        except (URLError, ConnectionError):
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def test_a_page_shows_the_character_while_it_plays(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))  # where Studio keeps its settings
+    player = Brief()
+    with shown(player) as address:
+        assert b"<canvas" in fetched(f"{address}/")
+        served = tmp_path / "served.mjb"
+        while player.steps < 3:
+            time.sleep(0.01)
+        served.write_bytes(fetched(f"{address}/model"))
+    assert mujoco.MjModel.from_binary_path(str(served)).nq == player.env.simulation.model.nq
+
+
+def test_what_is_beside_the_simulation_is_drawn_where_it_is():
+    stage, player = Stage(distance=3.0), Brief()
+    stage.viewer, stage.shapes = SimpleNamespace(extra_geoms=["an old one"]), player.shapes
+    stage.on_update(None)
+    [geom], [shape] = stage.viewer.extra_geoms, player.shapes
+    np.testing.assert_allclose(geom.pos, shape.position, rtol=1e-6)
+    np.testing.assert_allclose(geom.rgba, shape.colour)
+
+
+def test_the_camera_follows_the_first_body():
+    stage = Stage(distance=3.0)
+    stage.viewer = SimpleNamespace(model=Brief().env.simulation.model, camera=mujoco.MjvCamera())
+    stage.align_camera()
+    camera = stage.viewer.camera
+    assert (camera.type, camera.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
+    assert camera.distance == 3.0
+
+
+def test_the_pace_is_what_the_controls_say():
+    from mujoco.experimental.studio import messages, sim
+
+    pace = Pace()
+    assert (pace.paused, pace.speed) == (False, 1.0)
+    pace.on_step_control(messages.StepControlSnapshot(sim.PauseState.NORMAL_PAUSED, 50.0, 0.0, 0.0))
+    assert (pace.paused, pace.speed) == (True, 0.5)

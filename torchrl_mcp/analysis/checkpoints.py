@@ -1,0 +1,192 @@
+"""What the paper's figures show, asked of checkpoints: how they walk, explore, and take directions."""
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_mcp.analysis.exploration import Explorer, RandomSequence, fixed_latent, fixed_weights
+from torchrl_mcp.analysis.holdout import Trajectories, play_directions
+from torchrl_mcp.analysis.walks import Walk, record_walk, specialisation
+from torchrl_mcp.envs import CharacterEnv, Heading, Imitation
+from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.single import single_motion
+from torchrl_mcp.methods.actor import PRIMITIVES
+from torchrl_mcp.methods.option_critic import acting_option
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training import checkpoint
+
+EXPLORING = {
+    "mcp": "MCP, random weights",
+    "moe": "MOE, random weights",
+    "latent_space": "latent space, random latents",
+    "hierarchical": "hierarchical, random sequence",
+    "option_critic": "option-critic, random sequence",
+}
+"""Methods that have something to combine at random, and how to call that."""
+
+STEPS_PER_CHOICE = 30
+"""Control steps for which a primitive of a random sequence acts, about a walk cycle (appendix B)."""
+
+UNTRAINED = 10
+"""Networks before training, whose mean numbers are put beside those of trained ones."""
+
+SPACING = math.radians(7.5)
+"""Between the target directions of trajectories."""
+
+
+def configuration(path: Path) -> DictConfig:
+    """Return the configuration of a run folder's newest checkpoint, or of a checkpoint file.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    return OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
+
+
+def walk_of(
+    path: Path, *, clip: str | None, walkers: int, seconds: float, seed: int
+) -> tuple[Walk, Mapping[str, float]]:
+    """Return how a checkpoint of imitation walks, and how far untrained networks in its place specialise.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        clip: Name of the generated motion to follow, or None for the one straight ahead.
+        walkers: Characters, side by side.
+        seconds: Duration of the walk.
+        seed: Of the environments.
+
+    Raises:
+        ValueError: If the run is of another task, has no weights of primitives, or cannot walk.
+    """
+    cfg = configuration(path)
+    if cfg.task.name != "imitation":
+        raise ValueError(
+            f"{path} is of task={cfg.task.name}: Figure 7 is of pre-training, give a run of task=imitation"
+        )
+    if cfg.method.name not in ("mcp", "moe"):
+        raise ValueError(f"{path} is of method={cfg.method.name}, which has no weights: give a run of mcp or moe")
+    clips = single_motion(cfg.character.name, clip)
+    cfg, agent, env = experiment.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
+    walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
+    return walk, untrained(cfg, agent, cast("Imitation", env), walk)
+
+
+@torch.no_grad()
+def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk) -> Mapping[str, float]:
+    """Return how far networks before training specialise in the states of a walk: means of :data:`UNTRAINED` of them.
+
+    Args:
+        cfg: Configuration of their method.
+        agent: A trained agent of it, whose normalisers they share.
+        env: Environments of its sizes.
+        walk: That of the trained agent.
+    """
+    numbers = []
+    for seed in range(UNTRAINED):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            fresh = build.make_agent(cfg, env)
+        for name in ("observation_normaliser", "goal_normaliser"):
+            fresh.parts[name].load_state_dict(agent.parts[name].state_dict())
+        said = fresh.actor.policy(walk.inputs.clone())
+        gates, actions = (said[key].double().numpy() for key in ("gates", PRIMITIVES[0]))
+        numbers.append(specialisation(dataclasses.replace(walk, gates=gates, actions=actions)))
+    return {key: statistics.mean(row[key] for row in numbers) for key in numbers[0]}
+
+
+def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Generator) -> Explorer:
+    """Return how a method explores at random, as in Section 5.3.
+
+    Args:
+        cfg: Its configuration.
+        agent: Its networks.
+        num: Simulations that explore.
+        generator: Source of randomness.
+
+    Raises:
+        ValueError: If the method has nothing to combine.
+    """
+    parts, method = agent.parts, cfg.method.name
+    match method:
+        case "mcp" | "moe":
+            # Paper: Gaussian weights. Here the logits are, as with exploration=weights: weights stay between 0 and 1.
+            logits = torch.randn(num, cfg.num_primitives, generator=generator)
+            gates = instantiate(cfg.gating.activation)(logits)
+            return fixed_weights(parts["primitives"], instantiate(cfg.mixer.distribution_class), gates)
+        case "latent_space":
+            return fixed_latent(parts["decoder"], torch.randn(num, cfg.latent_dim, generator=generator))
+        case "hierarchical":
+            return RandomSequence(
+                parts["primitives"], num_options=cfg.num_primitives, steps=STEPS_PER_CHOICE, generator=generator
+            )
+        case "option_critic":
+
+            def options(state: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
+                loc, scale = parts["options"](state)
+                return acting_option(loc, scale, option)
+
+            return RandomSequence(options, num_options=cfg.num_options, steps=STEPS_PER_CHOICE, generator=generator)
+        case _:
+            raise ValueError(
+                f"method={method} has nothing to combine at random: give checkpoints of {', '.join(EXPLORING)}; "
+                "noise on actions, with which scratch begins, is drawn in any case"
+            )
+
+
+def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[CharacterEnv, TensorDictBase]:
+    """Return environments to explore, and the state in which all begin: in the middle of a walk, if it is known.
+
+    Episodes end with a fall or when the time is up.
+
+    Args:
+        cfg: Configuration of any run of the character.
+        num: Number of simulations.
+        seconds: Duration of an episode.
+        seed: Of the environments.
+    """
+    name = cfg.character.name
+    if name in CHARACTERS:
+        env: CharacterEnv = Heading(name, num, seed=seed, num_threads=cfg.num_threads)
+        moment = single_motion(name).at(torch.zeros(num, dtype=torch.int64), torch.zeros(num)).moment
+        start = {"qpos": moment.qpos, "qvel": moment.qvel}
+    else:
+        plain = OmegaConf.merge(cfg, {"transforms": []})
+        env = cast("CharacterEnv", build.make_env(cast("DictConfig", plain), num_envs=num, seed=seed))
+        env.reset()
+        start = {key: env.get_state()[key][:1].repeat(num, 1) for key in ("qpos", "qvel")}
+    env.max_episode_steps = round(seconds / env.control_timestep)
+    return env, TensorDict(start, env.batch_size)
+
+
+def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
+    """Return where a policy of the holdout task goes: on held-out directions, before transfer on those it saw as well.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        seed: Of the environments.
+
+    Returns:
+        Trajectories by a name that says when and where; of a run that is not over, that it is not.
+    """
+    cfg, panels = configuration(path), {}
+    over = path.is_file() or checkpoint.frames(checkpoint.find(path)) >= cfg.training.total_frames
+    pretrained = cfg.stage.name == "pretrain"
+    for shown in ("pretrain", "transfer") if pretrained else ("transfer",):
+        low, high = cfg.task.directions[shown]
+        directions = torch.linspace(low, high, round((high - low) / SPACING) + 1, dtype=torch.float64)
+        _, agent, env = experiment.restore(path, num_envs=len(directions), seed=seed)
+        how = (
+            ("as pre-trained" if over else "in pre-training") if pretrained else f"{'after' if over else 'in'} transfer"
+        )
+        where = "on directions it saw" if shown == "pretrain" else "on held-out directions"
+        panels[f"{how},\n{where}"] = play_directions(agent.actor.policy, env, directions)
+    return panels

@@ -1,0 +1,64 @@
+"""``torchrl-mcp-evaluate``: how good is a trained policy?
+
+With ``--output RUN/evaluation.json`` it leaves in a run folder what training ends with.
+"""
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from torchrl_mcp.evaluation.diagnostics import COLLAPSED
+from torchrl_mcp.runs.builtin import locate
+from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+
+
+def main() -> None:
+    """Play one episode in each of many environments and print what came of it."""
+    parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
+    )
+    parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
+    parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
+    parser.add_argument(
+        "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
+    )
+    parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
+    arguments = parser.parse_args()
+    try:
+        path = locate(arguments.checkpoint)
+        clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
+        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
+    except ValueError as error:
+        sys.exit(f"torchrl-mcp-evaluate: {error}")
+    print(f"{arguments.checkpoint}: {arguments.episodes} episodes, seed {arguments.seed}")
+    for mode in ("deterministic", "stochastic"):
+        numbers = results[mode]
+        low, high = numbers["interval"]
+        print(
+            f"  {mode:13} normalised return {numbers['normalised_return']:.3f} "
+            f"(95 % interval of the mean {low:.3f} to {high:.3f}, std {numbers['normalised_return_std']:.3f}), "
+            f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
+            + "".join(f", {name} {value:.3f}" for name, value in numbers["measures"].items())
+        )
+        for name, value in numbers["diagnostics"].items():
+            print(f"    {name:26} {value:.3f}")
+        if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
+            print("    the options have collapsed: one of them acts almost always")
+    if clips:
+        print(f"  {'clip':28} seconds  completed  tracking error  length")
+    for clip in clips:
+        print(
+            f"  {clip.clip:28} {clip.seconds:7.1f}  {clip.completed:9.0%}  {clip.tracking_error:12.3f} m  "
+            f"{clip.length:6.0f}"
+        )
+    if arguments.output:
+        numbers = results | ({"clips": [asdict(clip) for clip in clips]} if clips else {})
+        arguments.output.write_text(json.dumps(numbers, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""``torchrl-mcp-motions``: import motion capture, look at it, and rebuild the paper's corpus."""
+
+import argparse
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from zipfile import BadZipFile
+
+from torchrl_mcp.envs.motions import MotionClip
+from torchrl_mcp.envs.motions.capture.build import HUMANS
+from torchrl_mcp.envs.motions.capture.importer import import_motion
+from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
+from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
+from torchrl_mcp.envs.motions.inspection.summary import Summary, summary
+
+PROGRAM = "torchrl-mcp-motions"
+
+EXAMPLES = f"""\
+Files are BVH (.bvh), Acclaim (.amc, beside its .asf), DeepMimic (.json, .txt), or clips that this program wrote (.npz).
+
+examples:
+  {PROGRAM} import walk.bvh 02_01.amc --character humanoid --output clips
+  {PROGRAM} import walk.bvh --scale 0.3048 --map left_knee=LKnee --map right_knee=RKnee
+  {PROGRAM} inspect clips/*.npz
+  {PROGRAM} render clips/walk.npz --output pictures
+  {PROGRAM} build-paper-corpus downloads --output corpus
+"""
+
+PAPER_CORPUS = {
+    "humanoid3d_long_walk1.txt": 32.79,
+    "humanoid3d_long_walk2.txt": 24.56,
+    "humanoid3d_long_walk3.txt": 17.74,
+    "0005_Walking001.bvh": 39.09,
+    "humanoid3d_walk.txt": 1.27,
+}
+"""Seconds of each file. With mirror images of all but the last, which loops, they make the 230 s of appendix C."""
+
+SOURCES = {
+    ".txt": "https://github.com/xbpeng/DeepMimic, data/motions",
+    ".bvh": "https://mocap.cs.sfu.ca, subject 0005, Walking001",
+}
+
+COLUMNS = (
+    "clip",
+    "character",
+    "seconds",
+    "frames/s",
+    "m/s",
+    "|rad/s|",
+    "slide m/s",
+    "beyond limits",
+    "below ground",
+    "torque/limit",
+)
+"""Of the table, from the modules ``summary`` and ``feasibility`` of :mod:`torchrl_mcp.envs.motions.inspection`."""
+
+SLIDING = 0.2
+"""m/s. The feet of a motion that is read correctly slide less, those of one that is not more."""
+
+
+def main() -> None:
+    """Do what the command line says."""
+    arguments = _parser().parse_args()
+    try:
+        arguments.run(arguments)
+    except (BadZipFile, OSError, RuntimeError, ValueError) as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def import_files(arguments: argparse.Namespace) -> None:
+    """Write a clip for each file, and one of its mirror image if wanted."""
+    clips = _load(arguments)
+    if arguments.mirror:
+        clips |= {f"{name}_mirrored": clip.mirrored() for name, clip in clips.items()}
+    _save(clips, arguments.output)
+
+
+def inspect_files(arguments: argparse.Namespace) -> None:
+    """Say what motions are like."""
+    print(_table(_load(arguments)))
+
+
+def render_files(arguments: argparse.Namespace) -> None:
+    """Draw a contact sheet and a film of each motion."""
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for name, clip in _load(arguments).items():
+        sheet, film = arguments.output / f"{name}.png", arguments.output / f"{name}.gif"
+        save_picture(contact_sheet(clip), sheet)
+        save_film(clip, film, seconds=arguments.seconds)
+        print(f"{sheet}\n{film}")
+
+
+def build_paper_corpus(arguments: argparse.Namespace) -> None:
+    """Write the clips of the paper's corpus, from files that the user has downloaded."""
+    paths = {name: sorted(arguments.folder.rglob(name))[:1] for name in PAPER_CORPUS}
+    if missing := [name for name, found in paths.items() if not found]:
+        lines = "".join(f"\n  {name} (from {SOURCES[Path(name).suffix]})" for name in missing)
+        raise ValueError(f"{arguments.folder} lacks{lines}\nDownload them into it, and mind their terms of use.")
+    clips = {}
+    for name, [path] in paths.items():
+        clip = import_motion(path, arguments.character, rate=arguments.rate)
+        if abs(clip.duration - PAPER_CORPUS[name]) > 0.1:
+            expected = f"{path} lasts {clip.duration:.2f} s, and the paper's corpus needs {PAPER_CORPUS[name]:.2f} s"
+            raise ValueError(f"{expected}: it is another file, or was changed; download it again")
+        clips[path.stem] = clip
+        if not clip.loop:
+            clips[f"{path.stem}_mirrored"] = clip.mirrored()
+    _save(clips, arguments.output)
+
+
+def _load(arguments: argparse.Namespace) -> dict[str, MotionClip]:
+    """Read the files, by their names without suffix."""
+    clips: dict[str, MotionClip] = {}
+    for path in arguments.files:
+        if path.stem in clips:
+            raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
+        if path.suffix == ".npz":
+            clips[path.stem] = MotionClip.load(path)
+            continue
+        clips[path.stem] = import_motion(
+            path,
+            arguments.character,
+            rate=arguments.rate,
+            fps=arguments.fps,
+            scale=arguments.scale,
+            joint_map=_joint_map(arguments.map),
+            skip=arguments.skip,
+            rest_frame=arguments.rest_frame,
+            asf=arguments.asf,
+        )
+    return clips
+
+
+def _save(clips: Mapping[str, MotionClip], folder: Path) -> None:
+    """Write clips into a folder, and say what they are like."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, clip in clips.items():
+        clip.save(folder / f"{name}.npz")
+    print(f"{_table(clips)}\nwritten to {folder}")
+
+
+def _table(clips: Mapping[str, MotionClip]) -> str:
+    """Return a line for each clip, and warn of those whose feet slide."""
+    summaries = {name: summary(clip) for name, clip in clips.items()}
+    rows = [COLUMNS, *(_row(name, clip, summaries[name]) for name, clip in clips.items())]
+    rows.append(("total", "", f"{sum(numbers.duration for numbers in summaries.values()):.1f}", *[""] * 7))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
+        lines.append(
+            f"The feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
+        )
+    return "\n".join(lines)
+
+
+def _row(name: str, clip: MotionClip, numbers: Summary) -> tuple[str, ...]:
+    demand = feasibility(clip)
+    return (
+        name,
+        clip.character,
+        f"{numbers.duration:.2f}",
+        f"{clip.fps:.4g}{' loop' if clip.loop else ''}",
+        f"{numbers.speed:.2f}",
+        f"{numbers.turn_rate:.2f}",
+        "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
+        f"{math.degrees(demand.limit):.1f} deg",
+        f"{100 * demand.penetration:.1f} cm",
+        f"{demand.torque:.2f}",
+    )
+
+
+def _joint_map(pairs: list[str]) -> dict[str, str] | None:
+    """Read ``PART=JOINT``."""
+    if wrong := [pair for pair in pairs if "=" not in pair]:
+        raise ValueError(f"--map {wrong[0]} is not of the form PART=JOINT, such as left_knee=LKnee")
+    return {part.strip(): joint.strip() for part, _, joint in (pair.partition("=") for pair in pairs)} or None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Import motion capture, look at it, and rebuild the paper's corpus.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="command")
+    target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
+    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who shall move (default humanoid)")
+    target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
+    source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
+    source.add_argument("--fps", type=float, help="frames per second of the files, if not as they say (.amc: 120)")
+    source.add_argument("--scale", type=float, help="metres per unit of length; found by the length of the legs")
+    source.add_argument(
+        "--map", action="append", default=[], metavar="PART=JOINT", help="which joint is a part of the body; repeatable"
+    )
+    source.add_argument(
+        "--skip", type=int, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
+    )
+    source.add_argument(
+        "--rest-frame", type=int, metavar="N", help="frame, from 0, that stands, if the rest pose does not"
+    )
+    source.add_argument("--asf", type=Path, help="skeleton of .amc files, if it is not beside them")
+
+    command = commands.add_parser("import", parents=[source, target], help="write clips (.npz)")
+    command.add_argument("--mirror", action="store_true", help="write mirror images as well")
+    command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
+    command.set_defaults(run=import_files)
+    command = commands.add_parser("inspect", parents=[source, target], help="duration, speed, turn rate, slide, limits")
+    command.set_defaults(run=inspect_files)
+    command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
+    command.add_argument("--seconds", type=float, default=10.0, help="length of the film at most (default 10)")
+    command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
+    command.set_defaults(run=render_files)
+    command = commands.add_parser("build-paper-corpus", parents=[target], help="230 s of walking, from your downloads")
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="where the downloaded files are")
+    command.add_argument("--output", type=Path, default=Path("corpus"), help="folder for the clips (default corpus)")
+    command.set_defaults(run=build_paper_corpus)
+    return parser
+
+
+if __name__ == "__main__":
+    main()

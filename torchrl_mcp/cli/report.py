@@ -1,0 +1,145 @@
+"""``torchrl-mcp-report``: what came of many runs, beside the paper's figures, as a web page and as Markdown."""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from torchrl_mcp import __version__
+from torchrl_mcp.report.comparison import cells, over_tasks
+from torchrl_mcp.report.paper import METHODS, TABLE_2
+from torchrl_mcp.report.results import MODES, STATES, Damaged, Run, find_runs
+from torchrl_mcp.report.sections import (
+    Row,
+    Section,
+    ablation_chapters,
+    diagnostic_tables,
+    method_title,
+    place_title,
+    row,
+    task_sections,
+)
+
+PAGES = ("report.html", "report.md")
+
+HARDWARE = ("processor", "cores", "device")
+LIBRARIES = ("python", "torch", "torchrl", "mujoco")
+
+
+def main() -> None:
+    """Read run folders and write the report."""
+    parser = argparse.ArgumentParser(prog="torchrl-mcp-report", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or folders that hold some at any depth")
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write to (default report)")
+    arguments = parser.parse_args()
+    try:
+        runs, damaged = find_runs(arguments.runs)
+    except ValueError as error:
+        sys.exit(f"torchrl-mcp-report: {error}")
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for name, text in report(runs, damaged, moment=datetime.now(UTC)).items():
+        (arguments.output / name).write_text(text, encoding="utf-8")
+    counts = ", ".join(f"{number} {state}" for state, number in _states(runs, damaged).items() if number)
+    print(f"{len(runs) + len(damaged)} runs, {counts}: {' '.join(str(arguments.output / name) for name in PAGES)}")
+
+
+def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime) -> dict[str, str]:
+    """Return the report by file name, ``report.html`` and ``report.md``.
+
+    Args:
+        runs: Runs, in whatever state.
+        damaged: Folders that could not be read.
+        moment: When they were read.
+    """
+    environment = Environment(
+        loader=PackageLoader("torchrl_mcp.report"),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= FILTERS
+    context = _context(runs, damaged) | {"moment": f"{moment:%Y-%m-%d %H:%M %Z}", "version": __version__}
+    return {name: environment.get_template(name).render(context) for name in PAGES}
+
+
+def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
+    """What the templates show."""
+    found = cells(runs)
+    stages = {stage: [cell for cell in found if cell.stage == stage] for stage in ("transfer", "pretrain")}
+    names = (f"plot-{number}" for number in count(1))
+    machines = list(dict.fromkeys(map(_machine, runs)))
+    shared, aggregate = over_tasks(found)
+    context = {
+        "runs": [run for cell in found for run in cell.runs],
+        "states": _states(runs, damaged),
+        "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
+        "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_papers]),
+        "shared": shared,
+        "aggregate": aggregate,
+        "transfer": task_sections(stages["transfer"], names),
+        "ablations": ablation_chapters(found, names),
+        "diagnostics": diagnostic_tables(found),
+        "pretraining": task_sections(stages["pretrain"], names),
+        "machines": machines,
+    }
+    return context | {
+        "modes": MODES,
+        "table_2": TABLE_2,
+        "isfinite": math.isfinite,
+        "machine_number": lambda run: machines.index(_machine(run)) + 1,
+    }
+
+
+def _states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
+    """Number of runs by state."""
+    states = [run.state for run in runs] + ["damaged"] * len(damaged)
+    return {state: states.count(state) for state in STATES}
+
+
+def _overview(rows: Sequence[Row]) -> dict[str, Any]:
+    """Columns and rows of Table 2: the methods, and a section per task and character."""
+    present = dict.fromkeys(r.cell.method for r in rows)
+    methods = [*(method for method in METHODS if method in present), *(m for m in present if m not in METHODS)]
+    places = dict.fromkeys(r.cell.place for r in rows)
+    sections = {place: Section(place_title(place), [r for r in rows if r.cell.place == place]) for place in places}
+    return {"methods": methods, "sections": sections}
+
+
+def _machine(run: Run) -> str:
+    """The machine and the libraries of a run in one line."""
+    machine = run.origin.get("machine") or {}
+    parts = (
+        f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
+    )
+    versions = (f"{name} {machine[name]}" for name in LIBRARIES if name in machine)
+    return ", ".join([*parts, *versions]) or "unknown"
+
+
+def _duration(seconds: float) -> str:
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
+
+
+FILTERS = {
+    "figure": "{:.3f}".format,
+    "signed": lambda value: f"{value:+.3f}".replace("-", "−"),
+    "steps": "{:,}".format,
+    "duration": _duration,
+    "capital": lambda text: text[:1].upper() + text[1:],
+    "words": lambda name: name.replace("_", " ").capitalize(),
+    "place": place_title,
+    "method": method_title,
+    "cell": lambda text: str(text).replace("|", r"\|").replace("\n", " "),
+}
+"""Of the templates. ``cell`` is for Markdown's tables."""
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Episodes played for their returns, for each reference motion, and for what gates and options do in them."""

@@ -1,0 +1,66 @@
+"""How well a policy follows each of its reference motions."""
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_mcp.envs import Imitation
+from torchrl_mcp.evaluation.rollout import evaluate
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """Episodes that follow one clip.
+
+    Attributes:
+        clip: Its name.
+        seconds: Its duration, of one cycle where it loops.
+        episodes: Number of episodes.
+        completed: Share of them that neither fell nor lost the reference.
+        tracking_error: Mean distance of the bodies from the reference in metres, of the mean episode.
+        length: Mean length in control steps.
+    """
+
+    clip: str
+    seconds: float
+    episodes: int
+    completed: float
+    tracking_error: float
+    length: float
+
+
+def follow_each(
+    policy: TensorDictModuleBase, env: Imitation, *, deterministic: bool = True, device: torch.device | str = "cpu"
+) -> list[ClipResult]:
+    """Follow every clip in equally many episodes, which begin at moments spread evenly over it.
+
+    An episode that fits into its clip begins early enough to do so.
+
+    Args:
+        policy: From ``observation`` and ``goal`` to ``action``.
+        env: Environments without changes of the reference, a multiple of the number of clips.
+        deterministic: Play the deterministic action rather than a sample.
+        device: Where the policy is.
+
+    Raises:
+        ValueError: If the reference may change, or the clips do not divide the environments.
+    """
+    library, count = env.library, len(env.library)
+    if env.switch_probability:
+        raise ValueError("the reference changes within an episode: make the environment with switch_interval=inf")
+    if env.num_envs % count:
+        raise ValueError(f"num_envs={env.num_envs} is no multiple of the number of clips, {count}")
+    episodes = env.num_envs // count
+    needed = (env.max_episode_steps + 2) * env.control_timestep
+    latest = torch.where(library.loops | (library.durations < needed), library.durations, library.durations - needed)
+    clips = torch.arange(count).repeat_interleave(episodes)
+    times = latest[clips] * ((torch.arange(episodes, dtype=torch.float64) + 0.5) / episodes).repeat(count)
+    env.reset()
+    start = env.get_state().update(TensorDict(env.beginning(clips, times), env.batch_size))
+    outcome = evaluate(policy, env, start=start, deterministic=deterministic, device=device)
+    columns = (~outcome.terminated, outcome.measures["tracking_error"], outcome.lengths)
+    means = torch.stack([column.double().view(count, episodes).mean(1) for column in columns], 1).tolist()
+    rows = zip(library.names, library.durations.tolist(), means, strict=True)
+    return [ClipResult(name, seconds, episodes, *numbers) for name, seconds, numbers in rows]

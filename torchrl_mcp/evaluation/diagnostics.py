@@ -1,0 +1,36 @@
+"""What is said of a method's inner choices, in training and evaluation alike."""
+
+from tensordict import TensorDictBase
+
+from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.methods.options import OptionActor, option_diagnostics
+from torchrl_mcp.modules import gate_diagnostics
+
+DIAGNOSED = ("gates", "option", "begins")
+
+COLLAPSED = 1.1
+"""Effective number of options up to which one of them does everything."""
+
+
+def diagnosed(actor: Actor) -> list[str]:
+    """Return the keys that :func:`diagnostics` reads of what an actor writes."""
+    return [key for key in DIAGNOSED if key in actor.stored]
+
+
+def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
+    """Summarise the gates and options by which an actor acted.
+
+    Args:
+        actor: The actor.
+        samples: What it did, of any batch shape, with the keys ``actor.stored``.
+
+    Returns:
+        Numbers of :func:`~torchrl_mcp.modules.gate_diagnostics` under ``gates/``, if there are gates, and of
+        :func:`~torchrl_mcp.methods.options.option_diagnostics` under ``options/``, if options are chosen.
+    """
+    found = {}
+    if "gates" in actor.stored:
+        found["gates"] = gate_diagnostics(samples["gates"])
+    if isinstance(actor, OptionActor) and "begins" in actor.stored:
+        found["options"] = option_diagnostics(samples["option"], samples["begins"], actor.num_options)
+    return {f"{group}/{name}": value.item() for group, values in found.items() for name, value in values.items()}

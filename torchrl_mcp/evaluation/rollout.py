@@ -1,0 +1,121 @@
+"""How good is a policy? One episode in each of many environments."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes, one per environment.
+
+    Attributes:
+        returns: Undiscounted sum of rewards of each episode, ``(N,)``.
+        lengths: Control steps of each episode, ``(N,)``.
+        terminated: Whether the episode ended before its time limit, ``(N,)``.
+        positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
+        measures: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
+            as ``success``; of a number, its mean over the steps, as ``tracking_error``.
+        decisions: What was recorded of the policy, of all steps of all episodes, batch size ``(M,)``.
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    terminated: Tensor
+    positions: Tensor
+    measures: dict[str, Tensor] = field(default_factory=dict)
+    decisions: TensorDictBase = field(default_factory=TensorDict)
+
+
+@torch.no_grad()
+def evaluate(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    *,
+    deterministic: bool = True,
+    start: TensorDictBase | None = None,
+    record: Collection[NestedKey] = (),
+    device: torch.device | str = "cpu",
+) -> Evaluation:
+    """Play one episode in each environment of a batch, to its end.
+
+    Counting the first episodes to finish instead would favour short ones.
+
+    Args:
+        policy: From what the environments show, as ``observation`` and ``goal``, to ``action``.
+        env: Environments with batch size ``[N]`` whose episodes all end; what ``env.metric_names`` lists is measured.
+        deterministic: Play the deterministic action rather than a sample.
+        start: State to begin from, as of ``env.get_state()``, or None to draw it.
+        record: Keys of what the policy writes that are kept as ``decisions``.
+        device: Where the policy is.
+    """
+    exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    state = env.reset() if start is None else env.reset(start, set_state=True)
+    running = torch.ones(env.batch_size, dtype=torch.bool)
+    returns = torch.zeros(env.batch_size)
+    lengths = torch.zeros(env.batch_size, dtype=torch.int64)
+    terminated = torch.zeros_like(running)
+    positions: list[Tensor] = []
+    decisions: list[TensorDictBase] = []
+    flags: dict[str, Tensor] = {}
+    sums: dict[str, Tensor] = {}
+    names = getattr(env, "metric_names", {})
+    for key in names:
+        kind = flags if env.observation_spec[key].dtype is torch.bool else sums
+        kind[key] = torch.zeros_like(state[key])
+    with set_exploration_type(exploration):
+        while running.any():
+            decision = policy(state.select(*policy.in_keys).to(device))
+            decisions.append(decision.select(*record)[running.to(device)])
+            step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))
+            outcome = step["next"]
+            returns += outcome["reward"].squeeze(-1) * running
+            lengths += running
+            terminated |= running & outcome["terminated"].squeeze(-1)
+            for key, raised in flags.items():
+                raised |= running.unsqueeze(-1) & outcome[key]
+            for key, total in sums.items():
+                total += outcome[key] * running.unsqueeze(-1)
+            running &= ~outcome["done"].squeeze(-1)
+            positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
+    means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
+    measures = {
+        name: value
+        for key, values in (flags | means).items()
+        for name, value in zip(names[key], values.unbind(-1), strict=True)
+    }
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), measures, torch.cat(decisions))
+
+
+def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:
+    """Condense episodes into numbers.
+
+    Args:
+        outcome: The episodes.
+        normalised_return: The task's normalisation of returns.
+        resamples: Bootstrap resamples of the episodes behind ``interval``.
+
+    Returns:
+        Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
+        fraction, ``measures``), the standard deviation over episodes (0 of a single one), and a 95 % percentile
+        bootstrap interval of the mean.
+    """
+    normalised = normalised_return(outcome.returns)
+    generator = torch.Generator().manual_seed(0)
+    index = torch.randint(len(normalised), (resamples, len(normalised)), generator=generator)
+    low, high = normalised[index].mean(1).quantile(torch.tensor([0.025, 0.975])).tolist()
+    return {
+        "normalised_return": normalised.mean().item(),
+        "normalised_return_std": normalised.std(correction=min(1, len(normalised) - 1)).item(),
+        "interval": [low, high],
+        "return": outcome.returns.mean().item(),
+        "length": outcome.lengths.float().mean().item(),
+        "terminated": outcome.terminated.float().mean().item(),
+        "episodes": len(normalised),
+        "measures": {key: value.float().mean().item() for key, value in outcome.measures.items()},
+    }

@@ -1,0 +1,93 @@
+"""What methods share: networks become TensorDictModules.
+
+A method first makes named *parts*, plain modules that transfer keeps, freezes or starts anew by their names, and then
+an :class:`Actor` over them: the ``policy`` that acts, and what the loss differentiates, ``trained``. Both are one and
+the same unless the primitives are frozen, the exploration acts on the gate, or noise enters before the action.
+
+| key | content | shape |
+|---|---|---|
+| ``observation``, ``goal`` | state and goal as the environment gives them | ``(*B, S)``, ``(*B, G)`` |
+| ``normalised`` / ``observation``, ``goal`` | the same, standardised and clipped | |
+| ``gate_logits``, ``gates`` | before and after the gate's activation | ``(*B, K)`` |
+| ``primitives`` / ``loc``, ``scale`` | means and standard deviations of the primitives | ``(*B, K, A)`` |
+| ``action`` | what the environment plays | ``(*B, A)`` |
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tensordict import NestedKey
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+STATE = ("normalised", "observation")
+GOAL = ("normalised", "goal")
+PRIMITIVES = (("primitives", "loc"), ("primitives", "scale"))
+
+Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A policy in parts.
+
+    Attributes:
+        policy: What collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
+        trained: What the loss differentiates: gives the distribution of ``sampled`` from a stored sample.
+        stored: Keys, beside the environment's own, that a sample must hold for the loss and the diagnostics.
+        sampled: Key of the random variable whose log-probability the policy gradient takes.
+    """
+
+    policy: TensorDictModuleBase
+    trained: ProbabilisticTensorDictSequential
+    stored: tuple[NestedKey, ...] = ()
+    sampled: str = "action"
+
+    @property
+    def log_prob(self) -> str:
+        """Key of the log-probability of ``sampled`` under the policy that drew it."""
+        return f"{self.sampled}_log_prob"
+
+
+def input_normalisers(
+    observation_dim: int, goal_dim: int, normaliser: Callable[[int], RunningNormaliser]
+) -> dict[str, nn.Module]:
+    """Make the parts that :func:`normalise_inputs` needs.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        normaliser: Makes an input normaliser from a size.
+    """
+    return {"observation_normaliser": normaliser(observation_dim), "goal_normaliser": normaliser(goal_dim)}
+
+
+def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
+    """Return the module that standardises ``observation`` and ``goal`` by the parts of those names."""
+    return TensorDictSequential(
+        TensorDictModule(parts["observation_normaliser"], in_keys=["observation"], out_keys=[STATE]),
+        TensorDictModule(parts["goal_normaliser"], in_keys=["goal"], out_keys=[GOAL]),
+    )
+
+
+def sampler(
+    out_key: str, distribution_class: Callable[..., Distribution], **in_keys: NestedKey
+) -> ProbabilisticTensorDictModule:
+    """Return the module that draws ``out_key`` and stores its log-probability as ``<out_key>_log_prob``."""
+    return ProbabilisticTensorDictModule(
+        in_keys=in_keys,
+        out_keys=[out_key],
+        distribution_class=distribution_class,
+        return_log_prob=True,
+        default_interaction_type=InteractionType.RANDOM,
+    )

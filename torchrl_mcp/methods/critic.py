@@ -1,0 +1,29 @@
+"""Value functions as TensorDictModules."""
+
+from collections.abc import Sequence
+
+from tensordict.nn import TensorDictSequential
+from torch import nn
+from torchrl.modules import MLP, ValueOperator
+
+from torchrl_mcp.methods.actor import GOAL, STATE, normalise_inputs
+
+
+def value_critic(
+    parts: nn.ModuleDict, observation_dim: int, goal_dim: int, *, num_cells: Sequence[int] = (1024, 512)
+) -> TensorDictSequential:
+    """Add the part ``critic``, V(s, g), and return it as a module from ``observation`` and ``goal`` to ``state_value``.
+
+    Args:
+        parts: Parts of the actor, whose normalisers the critic shares; receives the critic.
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        num_cells: Hidden units.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.1. https://arxiv.org/abs/1905.09808
+    """
+    parts["critic"] = MLP(
+        in_features=observation_dim + goal_dim, out_features=1, num_cells=list(num_cells), activation_class=nn.ReLU
+    )
+    return TensorDictSequential(normalise_inputs(parts), ValueOperator(parts["critic"], in_keys=[STATE, GOAL]))

@@ -1,0 +1,75 @@
+r"""The finetuning model (Section E.3): one motion is imitated, then the goals of a task are injected.
+
+.. math:: \pi(a|s) = \mathcal{N}(\mu(s, 0), \Sigma) \quad \longrightarrow \quad
+    \pi(a|s, g) = \mathcal{N}(\mu(s, J g), \Sigma), \qquad J = 0
+
+As in Berseth et al., the inputs of pre-training stay, and new ones enter the first layer with weights of zero. The
+first policy of the task is the pre-trained one to the bit, whatever the goals, and then everything trains. The paper
+injects "goal inputs g that are not present during training", hence the policy imitates its motion blindly, from the
+state alone. The critic sees the reference, and starts anew for the task. Where pre-training has the task's own goal, as
+in the holdout, the policy sees it from the start and keeps its weights.
+
+A policy that does see the reference (``parts.blind=false`` in pre-training) is transferred in the same way. Its weights
+for the reference are dropped, which is to hold these inputs at their mean over pre-training, zero after
+normalisation: the first policy of the task is then, to the bit, the pre-trained one at that mean.
+
+Reference:
+    Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808
+    Berseth et al., *Progressive Reinforcement Learning with Distillation for Multi-Skilled Motion Control*, ICLR 2018.
+    https://arxiv.org/abs/1802.04765
+"""
+
+from collections.abc import Callable, Collection
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import nn
+from torchrl.modules import IndependentNormal
+
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.modules.injection import InjectedPolicy, InputInjection
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+
+def injected_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    policy: Callable[[int, int], InjectedPolicy],
+    blind: bool,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``policy`` and ``goal_input``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        policy: Makes the network from ``(S, A)``.
+        blind: Leave the weights of the goal at zero.
+        normaliser: Makes an input normaliser from a size.
+    """
+    network = policy(observation_dim, action_dim)
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "policy": network,
+            "goal_input": InputInjection(goal_dim, network.input.out_features).requires_grad_(not blind),
+        }
+    )
+
+
+def injected_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor:
+    """One Gaussian policy over the state, with the goal injected.
+
+    Args:
+        parts: Made by :func:`injected_parts`.
+        frozen: Names of the parts that do not change in training; the policy is evaluated in full all the same.
+    """
+    policy = ProbabilisticTensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(parts["goal_input"], in_keys=[GOAL], out_keys=["injection"]),
+        TensorDictModule(parts["policy"], in_keys=[STATE, "injection"], out_keys=["loc", "scale"]),
+        sampler("action", IndependentNormal, loc="loc", scale="scale"),
+    )
+    return Actor(policy, policy)

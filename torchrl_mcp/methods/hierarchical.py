@@ -1,0 +1,135 @@
+"""The hierarchical baseline: a gate picks one of K primitives and keeps to it for a walk cycle (Section E.4)."""
+
+from collections.abc import Callable, Collection
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.modules import IndependentNormal
+
+from torchrl_mcp.methods.actor import GOAL, STATE, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import OptionActor, WhereBeginning, keep_option
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+
+def primitive_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    primitives: Callable[..., nn.Module],
+    num_options: int,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts of pre-training: ``observation_normaliser``, ``goal_normaliser`` and ``primitives``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``, which only the critic sees.
+        action_dim: Size of the action, ``A``.
+        primitives: Makes the primitives from ``(S, A, K)``.
+        num_options: Number of primitives, ``K``.
+        normaliser: Makes an input normaliser from a size.
+    """
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "primitives": primitives(observation_dim, action_dim, num_options),
+        }
+    )
+
+
+def gated_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    gating: Callable[..., nn.Module],
+    primitives: Callable[..., nn.Module],
+    num_options: int,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts of transfer: those of :func:`primitive_parts` and ``gating``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        gating: Makes the network for the logits of the choice from ``(S, G, K)``.
+        primitives: Makes the primitives from ``(S, A, K)``.
+        num_options: Number of primitives, ``K``.
+        normaliser: Makes an input normaliser from a size.
+    """
+    parts = primitive_parts(
+        observation_dim, goal_dim, action_dim, primitives=primitives, num_options=num_options, normaliser=normaliser
+    )
+    parts["gating"] = gating(observation_dim, goal_dim, num_options)
+    return parts
+
+
+def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> OptionActor:
+    """Let the primitive act that the environment names as ``option``: all are trained side by side.
+
+    Args:
+        parts: Made by :func:`primitive_parts`.
+        num_options: Number of primitives, ``K``.
+        frozen: Names of the parts that do not change in training.
+    """
+    policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), *_acting(parts))
+    return OptionActor(policy, policy, stored=("option",), num_options=num_options)
+
+
+def gated_actor(
+    parts: nn.ModuleDict, *, num_options: int, steps_per_choice: int, frozen: Collection[str] = ()
+) -> OptionActor:
+    r"""Draw a primitive from the gate :math:`w(s, g)` every so many steps, and let it act meanwhile.
+
+    Args:
+        parts: Made by :func:`gated_parts`.
+        num_options: Number of primitives, ``K``.
+        steps_per_choice: Control steps for which a primitive acts.
+        frozen: Names of the parts that do not change in training.
+
+    Raises:
+        ValueError: If the primitives are not frozen, or ``steps_per_choice`` is not positive.
+    """
+    if "primitives" not in frozen:
+        raise ValueError("the choice of a primitive trains the gate alone: keep 'primitives' in transfer.freeze")
+    if steps_per_choice < 1:
+        raise ValueError(f"steps_per_choice must be at least 1, got {steps_per_choice}")
+    gate = WhereBeginning(parts["gating"], num_options)
+    choice = sampler("option", Categorical, logits="gate_logits")
+    trained = ProbabilisticTensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_logits"]),
+        choice,
+    )
+    policy = TensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(Clock(steps_per_choice), in_keys=["held_steps"], out_keys=["begins"]),
+        TensorDictModule(gate, in_keys=[STATE, GOAL, "begins"], out_keys=["gate_logits"]),
+        choice,
+        TensorDictModule(keep_option, in_keys=["begins", "option", "held_option"], out_keys=["option"]),
+        *_acting(parts),
+    )
+    return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
+
+
+class Clock(nn.Module):
+    """Tells when it is time for another choice."""
+
+    def __init__(self, steps_per_choice: int) -> None:
+        """Take the number of steps from one choice to the next."""
+        super().__init__()
+        self.steps_per_choice = steps_per_choice
+
+    def forward(self, held_steps: Tensor) -> Tensor:
+        """Return whether to choose, ``(*B)``, bool, from the steps since the last choice, 0 if there was none."""
+        return held_steps.remainder(self.steps_per_choice) == 0
+
+
+def _acting(parts: nn.ModuleDict) -> tuple[TensorDictModule, TensorDictModule]:
+    return (
+        TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["loc", "scale"]),
+        sampler("action", IndependentNormal, loc="loc", scale="scale"),
+    )

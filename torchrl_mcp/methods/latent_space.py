@@ -1,0 +1,95 @@
+r"""The latent space model (Section E.7): an encoder turns goals into skills, a decoder turns skills into actions.
+
+.. math:: w = \mu_q + \sigma_q \epsilon, \qquad \epsilon \sim \mathcal{N}(0, I), \qquad
+    \pi(a|s, w) = \mathcal{N}(\mu(s, w), \mathrm{diag}(\sigma^2))
+
+The noise :math:`\epsilon` is stored with each sample, as if it were a part of the state. The loss takes the ratio of
+policies at the same noise and differentiates through :math:`w`, which is how the encoder learns.
+
+| key | content | shape |
+|---|---|---|
+| ``latent`` / ``noise`` | :math:`\epsilon` | ``(*B, L)`` |
+| ``latent`` / ``loc``, ``scale`` | mean and standard deviation of the encoder | ``(*B, L)`` |
+| ``latent`` / ``sample`` | what the decoder sees of the goal, :math:`w` | ``(*B, L)`` |
+
+Reference:
+    Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
+    Merel et al., *Neural Probabilistic Motor Primitives for Humanoid Control*, ICLR 2019.
+"""
+
+from collections.abc import Callable, Collection
+
+import torch
+from tensordict.nn import InteractionType, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn.probabilistic import interaction_type
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal
+
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+NOISE = ("latent", "noise")
+ENCODING = (("latent", "loc"), ("latent", "scale"))
+LATENT = ("latent", "sample")
+
+
+def latent_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    encoder: Callable[..., nn.Module],
+    decoder: Callable[..., nn.Module],
+    latent_dim: int,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``encoder`` and ``decoder``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        encoder: Makes the network for mean and standard deviation of the latent variable from ``(S, G, L)``.
+        decoder: Makes the network for mean and standard deviation of the action from ``(S, L, A)``.
+        latent_dim: Size of the latent variable, ``L``.
+        normaliser: Makes an input normaliser from a size.
+
+    Raises:
+        ValueError: If ``latent_dim`` is not positive.
+    """
+    if latent_dim < 1:
+        raise ValueError(f"latent_dim must be at least 1, got {latent_dim}")
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "encoder": encoder(observation_dim, goal_dim, latent_dim),
+            "decoder": decoder(observation_dim, latent_dim, action_dim),
+        }
+    )
+
+
+def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor:
+    """Draw a latent variable and act on it; without exploration, on its mean.
+
+    Args:
+        parts: Made by :func:`latent_parts`.
+        frozen: Names of the parts that do not change in training; gradients pass through a frozen decoder all the same.
+    """
+    encoder = (
+        normalise_inputs(parts),
+        TensorDictModule(parts["encoder"], in_keys=[STATE, GOAL], out_keys=list(ENCODING)),
+    )
+    noise = TensorDictModule(latent_noise, in_keys=[ENCODING[0]], out_keys=[NOISE])
+    decoder = (
+        TensorDictModule(torch.addcmul, in_keys=[*ENCODING, NOISE], out_keys=[LATENT]),
+        TensorDictModule(parts["decoder"], in_keys=[STATE, LATENT], out_keys=["loc", "scale"]),
+        sampler("action", IndependentNormal, loc="loc", scale="scale"),
+    )
+    policy = ProbabilisticTensorDictSequential(*encoder, noise, *decoder)
+    return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,))
+
+
+def latent_noise(loc: Tensor) -> Tensor:
+    """Return standard normal noise in the shape of ``loc``, or zeros where TorchRL's exploration is off."""
+    random = interaction_type() in (InteractionType.RANDOM, None)
+    return torch.randn_like(loc) if random else torch.zeros_like(loc)

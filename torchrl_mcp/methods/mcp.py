@@ -1,0 +1,173 @@
+"""MCP: a gate composes primitives into one action distribution, Eq. 4 and Algorithm 1.
+
+The mixture of experts (Section E.6) is the same with another mixer, gate and primitives.
+"""
+
+from collections.abc import Callable, Collection
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal
+
+from torchrl_mcp.methods.actor import (
+    GOAL,
+    PRIMITIVES,
+    STATE,
+    Actor,
+    Composition,
+    input_normalisers,
+    normalise_inputs,
+    sampler,
+)
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+
+def composite_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    gating: Callable[..., nn.Module],
+    gate_activation: Callable[[Tensor], Tensor],
+    primitives: Callable[..., nn.Module],
+    num_primitives: int,
+    distribution_class: Composition,
+    initial_std: float,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating`` and ``primitives``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        gating: Makes the network for gate logits from ``(S, G, K)``.
+        gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
+        primitives: Makes the primitives from ``(S, A, K, initial_std=)``.
+        num_primitives: Number of primitives, ``K``.
+        distribution_class: The mixer, of ``(loc, scale, gates)``.
+        initial_std: Standard deviation of the *composite* before training, in action units, whatever ``K`` and mixer.
+        normaliser: Makes an input normaliser from a size.
+
+    Raises:
+        ValueError: If ``num_primitives`` is not positive.
+    """
+    if num_primitives < 1:
+        raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
+    # Both mixers scale with their primitives: compose K unit Gaussians at the gate's initial weights and divide.
+    gates = gate_activation(torch.zeros(num_primitives))
+    unit = torch.ones(num_primitives, 1)
+    composite = distribution_class(torch.zeros_like(unit), unit, gates)
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "gating": gating(observation_dim, goal_dim, num_primitives),
+            "primitives": primitives(
+                observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
+            ),
+        }
+    )
+
+
+def composite_actor(
+    parts: nn.ModuleDict,
+    *,
+    gate_activation: nn.Module,
+    distribution_class: Composition,
+    frozen: Collection[str] = (),
+) -> Actor:
+    r"""Gate K primitives and compose them into one action distribution, :math:`\pi(a|s, g)` of Eq. 4.
+
+    With ``primitives`` among ``frozen``, their outputs are stored with each sample and the loss evaluates the gate
+    alone.
+
+    Args:
+        parts: Made by :func:`composite_parts`.
+        gate_activation: From logits to weights.
+        distribution_class: The mixer, of ``(loc, scale, gates)``.
+        frozen: Names of the parts that do not change in training.
+    """
+    primitives = TensorDictModule(parts["primitives"], in_keys=[STATE], out_keys=list(PRIMITIVES))
+    gate = (
+        TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_logits"]),
+        TensorDictModule(gate_activation, in_keys=["gate_logits"], out_keys=["gates"]),
+    )
+    head = sampler("action", distribution_class, loc=PRIMITIVES[0], scale=PRIMITIVES[1], gates="gates")
+    policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), primitives, *gate, head)
+    if "primitives" not in frozen:
+        return Actor(policy, policy, stored=("gates",))
+    trained = ProbabilisticTensorDictSequential(normalise_inputs(parts), *gate, head)
+    return Actor(policy, trained, stored=("gates", *PRIMITIVES))
+
+
+def weights_actor(
+    parts: nn.ModuleDict,
+    *,
+    gate_activation: nn.Module,
+    distribution_class: Composition,
+    logits_std: float,
+    frozen: Collection[str] = (),
+) -> Actor:
+    r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
+
+    The gate's logits are Gaussian with a fixed standard deviation. They are what the policy gradient scores, so that
+    the primitives appear in no gradient and must be frozen.
+
+    Args:
+        parts: Made by :func:`composite_parts`.
+        gate_activation: From logits to weights.
+        distribution_class: The mixer, of ``(loc, scale, gates)``.
+        logits_std: Standard deviation of the logits.
+        frozen: Names of the parts that do not change in training.
+
+    Raises:
+        ValueError: If the primitives are not frozen.
+    """
+    if "primitives" not in frozen:
+        raise ValueError(
+            "exploration over weights trains the gate alone: use it with stage=transfer and keep 'primitives' in "
+            "transfer.freeze, or take exploration=action"
+        )
+    trained = ProbabilisticTensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_loc"]),
+        TensorDictModule(ConstantScale(logits_std), in_keys=["gate_loc"], out_keys=["gate_scale"]),
+        sampler("gate_logits", IndependentNormal, loc="gate_loc", scale="gate_scale"),
+    )
+    policy = TensorDictSequential(
+        trained,
+        TensorDictModule(gate_activation, in_keys=["gate_logits"], out_keys=["gates"]),
+        TensorDictModule(parts["primitives"], in_keys=[STATE], out_keys=list(PRIMITIVES)),
+        TensorDictModule(DeterministicAction(distribution_class), in_keys=[*PRIMITIVES, "gates"], out_keys=["action"]),
+    )
+    return Actor(policy, trained, stored=("gates", "gate_logits"), sampled="gate_logits")
+
+
+class ConstantScale(nn.Module):
+    """A standard deviation that depends on nothing."""
+
+    def __init__(self, std: float) -> None:
+        """Take the standard deviation, positive."""
+        super().__init__()
+        if not std > 0:
+            raise ValueError(f"logits_std must be positive, got {std}")
+        self.std = std
+
+    def forward(self, loc: Tensor) -> Tensor:
+        """Return the standard deviation in the shape of ``loc``."""
+        return torch.full_like(loc, self.std)
+
+
+class DeterministicAction(nn.Module):
+    """The deterministic action of a composite."""
+
+    def __init__(self, distribution_class: Composition) -> None:
+        """Take the mixer."""
+        super().__init__()
+        self.distribution_class = distribution_class
+
+    def forward(self, loc: Tensor, scale: Tensor, gates: Tensor) -> Tensor:
+        """Return the action ``(*B, A)`` of primitives ``(*B, K, A)`` under gates ``(*B, K)``."""
+        action: Tensor = self.distribution_class(loc, scale, gates).deterministic_sample  # type: ignore[attr-defined]
+        return action

@@ -1,0 +1,155 @@
+r"""The option-critic baseline: options that end when they see fit, and values that choose among them (Section E.5).
+
+.. math::
+    U(\omega, s') = (1 - \beta_\omega(s')) Q_\Omega(s', \omega) + \beta_\omega(s') V_\Omega(s')
+
+is the value of arriving in s' with the option :math:`\omega`, which is part of what the critic must be able to tell:
+it gives the values of all options and the probabilities with which they end.
+
+| key | content | shape |
+|---|---|---|
+| ``held_option``, ``held_steps`` | the option of the step before, and for how long it has acted | ``(*B)`` |
+| ``begins``, ``option`` | whether an option begins, and which one acts | ``(*B)`` |
+| ``option_values``, ``terminations`` | Q and beta of all options | ``(*B, K)`` |
+| ``termination`` | beta of the option that acted, where it led | ``(*B)`` |
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+
+import torch
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torchrl.modules import MLP, IndependentNormal
+
+from torchrl_mcp.methods.actor import GOAL, PRIMITIVES, STATE, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import EpsilonGreedy, OptionActor, WhereBeginning, keep_option, of_option
+from torchrl_mcp.modules.normaliser import RunningNormaliser
+
+ARRIVAL = ("next", "observation")
+
+
+def option_critic_parts(
+    observation_dim: int,
+    goal_dim: int,
+    action_dim: int,
+    *,
+    options: Callable[..., nn.Module],
+    terminations: Callable[..., nn.Module],
+    values_cells: Sequence[int],
+    num_options: int,
+    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+) -> nn.ModuleDict:
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``options``, ``terminations`` and ``critic``.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+        action_dim: Size of the action, ``A``.
+        options: Makes the network of all options, from a state to means and standard deviations, from ``(S, A, K)``.
+        terminations: Makes the network of their terminations from ``(S, K)``.
+        values_cells: Hidden units of their values.
+        num_options: Number of options, ``K``.
+        normaliser: Makes an input normaliser from a size.
+    """
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "options": options(observation_dim, action_dim, num_options),
+            "terminations": terminations(observation_dim, num_options),
+            "critic": MLP(
+                in_features=observation_dim + goal_dim,
+                out_features=num_options,
+                num_cells=list(values_cells),
+                activation_class=nn.ReLU,
+            ),
+        }
+    )
+
+
+def option_critic_actor(
+    parts: nn.ModuleDict, *, num_options: int, epsilon: float, frozen: Collection[str] = ()
+) -> OptionActor:
+    r"""Choose the option of highest value when none is held or the held one ends, and let it act.
+
+    Terminations are drawn in deterministic interaction as well: no threshold on :math:`\beta` would keep the rates at
+    which options change. Deterministic are then the choice of the option and its action.
+
+    Args:
+        parts: Made by :func:`option_critic_parts`.
+        num_options: Number of options, ``K``.
+        epsilon: Probability of a random choice.
+        frozen: Names of the parts that do not change in training.
+    """
+    values = WhereBeginning(parts["critic"], num_options)
+    drawn = sampler("option", partial(EpsilonGreedy, epsilon=epsilon), values="option_values")
+    policy = TensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(parts["terminations"], in_keys=[STATE], out_keys=["terminations"]),
+        TensorDictModule(begins, in_keys=["terminations", "held_option", "held_steps"], out_keys=["begins"]),
+        TensorDictModule(values, in_keys=[STATE, GOAL, "begins"], out_keys=["option_values"]),
+        drawn,
+        TensorDictModule(keep_option, in_keys=["begins", "option", "held_option"], out_keys=["option"]),
+        *_acting(parts),
+    )
+    arriving: tuple[TensorDictModule, ...] = ()
+    if "terminations" not in frozen:
+        normaliser, state = parts["observation_normaliser"], ("normalised", "arrival")
+        arriving = (
+            TensorDictModule(normaliser, in_keys=[ARRIVAL], out_keys=[state]),
+            TensorDictModule(parts["terminations"], in_keys=[state], out_keys=["terminations"]),
+            TensorDictModule(termination, in_keys=["terminations", "option"], out_keys=["termination"]),
+        )
+    trained = ProbabilisticTensorDictSequential(normalise_inputs(parts), *arriving, *_acting(parts))
+    return OptionActor(policy, trained, stored=("option", "begins"), num_options=num_options)
+
+
+def option_values(parts: nn.ModuleDict, observation_dim: int, goal_dim: int) -> TensorDictSequential:
+    r"""Return the critic: from ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
+
+    Args:
+        parts: Made by :func:`option_critic_parts`, whose ``critic`` is :math:`Q_\Omega(s, g, \omega)`.
+        observation_dim: Size of the state, ``S``.
+        goal_dim: Size of the goal, ``G``.
+    """
+    return TensorDictSequential(
+        normalise_inputs(parts),
+        TensorDictModule(parts["critic"], in_keys=[STATE, GOAL], out_keys=["option_values"]),
+        TensorDictModule(parts["terminations"], in_keys=[STATE], out_keys=["terminations"]),
+    )
+
+
+def begins(terminations: Tensor, held_option: Tensor, held_steps: Tensor) -> Tensor:
+    """Draw whether an option begins, ``(*B)``, bool: none is held, or the held one ends.
+
+    Args:
+        terminations: Probabilities with which options end, shape ``(*B, K)``.
+        held_option: The option of the step before, shape ``(*B)``.
+        held_steps: For how many steps it has acted, 0 if there is none, shape ``(*B)``.
+    """
+    ends = termination(terminations, held_option)
+    return (held_steps == 0) | (torch.rand_like(ends) < ends)
+
+
+def termination(terminations: Tensor, option: Tensor) -> Tensor:
+    """Return from probabilities ``(*B, K)`` those of the options ``(*B)``."""
+    return of_option(terminations, option).squeeze(-1)
+
+
+def acting_option(loc: Tensor, scale: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation of the options ``(*B)``, each ``(*B, A)``, from all, each ``(*B, K, A)``."""
+    index = option[..., None, None].expand(*option.shape, 1, loc.shape[-1])
+    return loc.gather(-2, index).squeeze(-2), scale.gather(-2, index).squeeze(-2)
+
+
+def _acting(parts: nn.ModuleDict) -> tuple[TensorDictModule, TensorDictModule, ProbabilisticTensorDictModule]:
+    return (
+        TensorDictModule(parts["options"], in_keys=[STATE], out_keys=list(PRIMITIVES)),
+        TensorDictModule(acting_option, in_keys=[*PRIMITIVES, "option"], out_keys=["loc", "scale"]),
+        sampler("action", IndependentNormal, loc="loc", scale="scale"),
+    )

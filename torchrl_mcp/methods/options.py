@@ -1,0 +1,159 @@
+"""Options: policies of which one acts at a time, blind to the goal, chosen by another policy that sees it."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Categorical
+
+from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+
+
+@dataclass(frozen=True)
+class OptionActor(Actor):
+    """An actor whose samples hold the ``option`` that acted.
+
+    Attributes:
+        num_options: Number of options, ``K``.
+    """
+
+    num_options: int = 0
+
+
+class SeparateOptions(nn.Module):
+    r"""K policies :math:`\pi_\omega(a|s)` without a shared weight; each evaluates only the samples in which it acts.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        action_dim: Size of the action, ``A``.
+        num_options: Number of options, ``K``.
+        policy: Makes the network of one, as of the scratch model, from ``(S, G, A)``; the goal has no features here.
+    """
+
+    def __init__(
+        self, observation_dim: int, action_dim: int, num_options: int, *, policy: Callable[..., nn.Module]
+    ) -> None:
+        super().__init__()
+        _require_options(num_options)
+        self.policies = nn.ModuleList(policy(observation_dim, 0, action_dim) for _ in range(num_options))
+
+    def forward(self, observation: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, each ``(*B, A)``, of the options ``(*B)`` in the states ``(*B, S)``."""
+        order = option.flatten().argsort()
+        counts = option.flatten().bincount(minlength=len(self.policies)).tolist()
+        states = observation.flatten(0, -2)[order].split(counts)
+        outputs = [policy(state, state[:, :0]) for policy, state in zip(self.policies, states, strict=True)]
+        back = order.argsort()
+        loc, scale = (torch.cat(output)[back].unflatten(0, option.shape) for output in zip(*outputs, strict=True))
+        return loc, scale
+
+
+class Terminations(nn.Module):
+    r"""The probabilities :math:`\beta_\omega(s)` with which options end.
+
+    Args:
+        observation_dim: Size of the state, ``S``.
+        num_options: Number of options, ``K``.
+        num_cells: Hidden units.
+        initial: Probability before training: an option lasts ``1 / initial`` steps on average.
+
+    Raises:
+        ValueError: If ``initial`` is no probability between 0 and 1.
+    """
+
+    def __init__(self, observation_dim: int, num_options: int, *, num_cells: Sequence[int], initial: float) -> None:
+        super().__init__()
+        _require_options(num_options)
+        if not 0 < initial < 1:
+            raise ValueError(f"initial={initial} is no probability of termination: pass a number between 0 and 1")
+        self.body = relu_mlp(observation_dim, num_cells)
+        self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
+        nn.init.constant_(self.output.bias, math.log(initial / (1 - initial)))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return ``(*B, K)`` from a state ``(*B, S)``."""
+        return self.output(self.body(observation)).float().sigmoid()
+
+
+class WhereBeginning(nn.Module):
+    """Evaluates scores only where an option begins: elsewhere nobody asks, and they are zero.
+
+    Args:
+        scores: From state ``(n, S)`` and goal ``(n, G)`` to ``(n, K)``.
+        num_options: Number of options, ``K``.
+    """
+
+    def __init__(self, scores: nn.Module, num_options: int) -> None:
+        super().__init__()
+        self.scores, self.num_options = scores, num_options
+
+    def forward(self, observation: Tensor, goal: Tensor, begins: Tensor) -> Tensor:
+        """Return ``(*B, K)``."""
+        scores = torch.zeros(*begins.shape, self.num_options, device=begins.device)
+        scores[begins] = self.scores(observation[begins], goal[begins]).float()
+        return scores
+
+
+class EpsilonGreedy(Categorical):
+    r"""The policy over options that values define: the best one, or with probability :math:`\epsilon` any.
+
+    .. math:: \pi_\Omega(\omega|s, g) = (1 - \epsilon) [\omega = \arg\max Q_\Omega(s, g, \cdot)] + \epsilon / K
+
+    Args:
+        values: Values of the options, shape ``(*B, K)``.
+        epsilon: Probability :math:`\epsilon` of a random choice.
+
+    Example:
+        >>> EpsilonGreedy(torch.tensor([0.0, 2.0, 1.0, 0.0]), epsilon=0.2).probs
+        tensor([0.0500, 0.8500, 0.0500, 0.0500])
+    """
+
+    def __init__(self, values: Tensor, epsilon: float) -> None:
+        self._best = values.argmax(-1)
+        best = nn.functional.one_hot(self._best, values.shape[-1])
+        super().__init__(probs=(1 - epsilon) * best + epsilon / values.shape[-1])
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The option of highest value, ``(*B)``."""
+        return self._best
+
+
+def keep_option(begins: Tensor, drawn: Tensor, held: Tensor) -> Tensor:
+    """Return the options ``drawn`` where one begins and those ``held`` elsewhere, each ``(*B)``."""
+    return torch.where(begins, drawn, held)
+
+
+def of_option(values: Tensor, option: Tensor) -> Tensor:
+    """Return from values ``(*B, K)`` those of the options ``(*B)``, or one for all, as ``(*B, 1)``."""
+    return values.gather(-1, option.unsqueeze(-1).expand(*values.shape[:-1], 1))
+
+
+def option_diagnostics(option: Tensor, begins: Tensor, num_options: int) -> dict[str, Tensor]:
+    """Summarise which of the options act, and how long: have they collapsed into one, do they switch at every step?
+
+    ``usage_k`` is the share of steps in which option k acts, ``effective_options`` the exponential of the entropy of
+    these shares: 1 where one option does everything. ``begin_rate`` is the share of steps in which an option begins,
+    at the start of an episode or after another has ended, and ``duration`` its inverse, the mean number of steps.
+
+    Args:
+        option: The option that acts, shape ``(*B)``, int64.
+        begins: Whether it has been chosen in this step, shape ``(*B)``, bool.
+        num_options: Number of options, ``K``.
+    """
+    usage = option.flatten().bincount(minlength=num_options) / option.numel()
+    rate = begins.float().mean()
+    return {
+        "effective_options": torch.special.entr(usage).sum().exp(),
+        "begin_rate": rate,
+        "duration": rate.reciprocal(),
+        **{f"usage_{k}": share for k, share in enumerate(usage)},
+    }
+
+
+def _require_options(num_options: int) -> None:
+    if num_options < 1:
+        raise ValueError(f"num_options must be at least 1, got {num_options}")

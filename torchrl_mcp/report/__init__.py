@@ -1,0 +1,1 @@
+"""The report: what came of many runs, beside the paper's figures."""

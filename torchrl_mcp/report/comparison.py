@@ -1,0 +1,284 @@
+"""Runs side by side: which may be averaged, what tells the others apart, and what the paper says of them."""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+from torchrl_mcp.report.paper import METHODS, PLACES, SETTINGS, TABLE_2, Reported
+from torchrl_mcp.report.results import Run
+from torchrl_mcp.report.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
+
+Key = TypeVar("Key", bound=Hashable)
+Item = TypeVar("Item")
+
+# What changes where, how fast or how visibly a run learns, not what it learns; the stages' environments are in task.*.
+BOOKKEEPING = (
+    *("seed", "device", "autocast", "num_threads", "torch_threads", "collector", "benchmark", "evaluation"),
+    *("pretrained", "resume", "run_root", "run_dir", "checkpoint_interval", "keep_checkpoints"),
+    *("progress_bar", "logger", "motions", "imitation", "task.fast", "task.evaluation"),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs that differ in their seeds alone, as far as they tell.
+
+    Attributes:
+        place: Task and character.
+        stage: ``pretrain`` or ``transfer``.
+        method: Name of the method.
+        settings: What tells it from other cells of the same place, stage and method.
+        choices: :func:`choices` of its runs.
+        runs: Ordered by seed.
+    """
+
+    place: tuple[str, str]
+    stage: str
+    method: str
+    settings: Mapping[str, Any]
+    choices: Mapping[str, Any]
+    runs: Sequence[Run]
+
+    @cached_property
+    def complete(self) -> list[Run]:
+        """Runs that have taken all their steps and were evaluated; the others are in no mean."""
+        return [run for run in self.runs if run.state == "complete"]
+
+    @property
+    def is_papers(self) -> bool:
+        """Whether it is a method of Table 2, not a variant of one."""
+        papers = SETTINGS.get(self.method, {})
+        return all(self.choices.get(name) == value for name, value in papers.items())
+
+    @property
+    def reported(self) -> Reported | None:
+        """The paper's figure, if it has one."""
+        comparable = self.stage == "transfer" and self.is_papers
+        return TABLE_2.get((*self.place, self.method)) if comparable else None
+
+    def returns(self, mode: str = "deterministic") -> list[float]:
+        """Normalised returns of the complete runs, each a mean over episodes."""
+        return [run.evaluation[mode]["normalised_return"] for run in self.complete]
+
+    def mean(self, mode: str = "deterministic") -> Estimate | None:
+        """Mean over seeds with its interval; of a single seed, with the interval over its episodes."""
+        if len(self.complete) == 1:
+            numbers = self.complete[0].evaluation[mode]
+            return Estimate(numbers["normalised_return"], *numbers["interval"])
+        return mean(self.returns(mode)) if self.complete else None
+
+    def deviation(self, mode: str = "deterministic") -> float:
+        """Standard deviation over seeds, NaN of fewer than two."""
+        return deviation(self.returns(mode))
+
+    @property
+    def gap(self) -> float | None:
+        """Our deterministic mean over seeds less the paper's."""
+        ours = self.mean()
+        return ours.value - self.reported.mean if ours and self.reported else None
+
+    @property
+    def seconds(self) -> float:
+        """Mean wall time of the complete runs, or of all so far where none is."""
+        runs = self.complete or self.runs
+        return sum(run.seconds for run in runs) / len(runs)
+
+    @property
+    def speed(self) -> float:
+        """Environment steps per second of all runs together, NaN before the first."""
+        seconds = sum(run.seconds for run in self.runs)
+        return sum(run.frames for run in self.runs) / seconds if seconds else math.nan
+
+    @property
+    def commits(self) -> list[str]:
+        """Commits of its runs."""
+        return list(dict.fromkeys(run.commit for run in self.runs))
+
+    @property
+    def standing(self) -> str:
+        """How far its runs have come, of a cell without a complete one."""
+        if any(run.state == "unfinished" for run in self.runs):
+            return f"{sum(run.progress for run in self.runs) / len(self.runs):.0%} trained"
+        return self.runs[0].state
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Means over seeds of what else the task measures of deterministic episodes, terms of the reward aside."""
+        return shared_means([run.evaluation["deterministic"].get("measures", {}) for run in self.complete], "reward_")
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader should know before trusting its numbers."""
+        standings = _grouped((run for run in self.runs if run.state != "complete"), _standing)
+        seeds = [run.seed for run in self.runs]
+        return [
+            *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
+            *(["one seed, so that the interval is over its episodes"] if len(self.complete) == 1 else []),
+            *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
+            *(f"mixed {found}" for found in _mixed("evaluations", map(_protocol, self.complete))),
+        ]
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """Cells of one method that differ in one setting.
+
+    Attributes:
+        setting: Its name.
+        cells: In the order of its values.
+    """
+
+    setting: str
+    cells: Sequence[Cell]
+
+
+def choices(run: Run) -> dict[str, Any]:
+    """Settings that have a name of their own in the paper or the command line, None where a method has none such."""
+    settings = run.settings
+    transfers = run.stage == "transfer" and "primitives" in settings.get("transfer.keep", ())
+    trained = "gate" if "primitives" in settings.get("transfer.freeze", ()) else "gate and primitives"
+    return {
+        "preset": run.preset,
+        "total_frames": run.total_frames,
+        "num_primitives": settings.get("num_primitives"),
+        "num_options": settings.get("num_options"),
+        "latent_dim": settings.get("latent_dim"),
+        "trained": trained if transfers else None,
+        "mixer": settings.get("mixer.name"),
+        "exploration": settings.get("exploration.name"),
+        "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
+    }
+
+
+def cells(runs: Iterable[Run]) -> list[Cell]:
+    """Group runs into cells, in the paper's order of tasks, stages and methods.
+
+    Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or, where these are
+    alike, any other value of their configuration, :data:`BOOKKEEPING` aside. Commits do not part them: a cell remarks
+    on them.
+    """
+    found = []
+    for alike in _grouped(runs, lambda run: (run.place, run.stage, run.method)).values():
+        telling = _varying([choices(run) for run in alike])
+        for chosen in _grouped(alike, lambda run: _frozen(choices(run))).values():
+            found += _cells(chosen, telling)
+    return sorted(found, key=_order)
+
+
+def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
+    """Return where a method was trained with several values of a choice, all other settings alike."""
+
+    def rest(cell: Cell) -> Hashable:
+        others = _frozen({k: v for k, v in {**cell.choices, **cell.settings}.items() if k != setting})
+        return cell.place, cell.stage, cell.method, others
+
+    groups = _grouped((cell for cell in cells if cell.choices[setting] is not None), rest).values()
+    return [
+        Ablation(setting, sorted(group, key=lambda cell: cell.choices[setting])) for group in groups if len(group) > 1
+    ]
+
+
+def caveats(cells: Sequence[Cell]) -> list[str]:
+    """Return what differs between cells beside their methods, and may be why they differ in their results."""
+    runs = [run for cell in cells for run in cell.runs]
+    steps = {
+        method: sorted({run.total_frames for run in group})
+        for method, group in _grouped(runs, lambda run: run.method).items()
+    }
+    return [
+        *_mixed("presets", (run.preset for run in runs)),
+        *_mixed("commits", (run.commit for run in runs)),
+        *_mixed("evaluations", (_protocol(run) for run in runs if run.state == "complete")),
+        *(
+            f"steps of {METHODS.get(method, method)}: {', '.join(f'{total:,}' for total in totals)}"
+            for method, totals in steps.items()
+            if len(totals) > 1
+        ),
+    ]
+
+
+def over_tasks(cells: Iterable[Cell]) -> tuple[list[tuple[str, str]], dict[str, Estimate]]:
+    """Return the tasks of Table 2 in which all methods were evaluated, and each method's interquartile mean over them.
+
+    A method with several cells in a task has no single result there. Fewer than two methods or tasks compare nothing.
+    """
+    scores: dict[str, dict[tuple[str, str], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
+    for cell in cells:
+        if cell.stage == "transfer" and cell.is_papers and cell.complete:
+            scores[cell.method][cell.place].append(cell.returns())
+    single = {m: {p: r[0] for p, r in places.items() if len(r) == 1} for m, places in scores.items()}
+    shared = [place for place in PLACES if all(place in places for places in single.values())]
+    if len(single) < 2 or len(shared) < 2:
+        return [], {}
+    return shared, {method: interquartile_mean([places[p] for p in shared]) for method, places in single.items()}
+
+
+def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
+    """Cells of runs with the same choices, of which ``telling`` are the names of those that tell them from others."""
+    others = _varying([_learned(run) for run in runs])
+    found = []
+    for alike in _grouped(runs, lambda run: _frozen(_learned(run), others)).values():
+        first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
+        settings = {name: named[name] for name in telling if named[name] is not None}
+        settings |= {name: learned[name] for name in others}
+        by_seed = sorted(alike, key=lambda run: run.seed)
+        found.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
+    return found
+
+
+def _learned(run: Run) -> dict[str, Any]:
+    """What of a run's configuration may change what it learns."""
+    other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
+    ignored = (*BOOKKEEPING, other_stage)
+    return {
+        name: value
+        for name, value in run.settings.items()
+        if not any(name == prefix or name.startswith(f"{prefix}.") for prefix in ignored)
+    }
+
+
+def _varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names that all have, with more than one value."""
+    names = [name for name in settings[0] if all(name in other for other in settings)]
+    return [name for name in names if len({repr(other[name]) for other in settings}) > 1]
+
+
+def _frozen(settings: Mapping[str, Any], names: Iterable[str] | None = None) -> Hashable:
+    return tuple((name, repr(settings[name])) for name in (settings if names is None else names))
+
+
+def _grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    groups: dict[Key, list[Item]] = defaultdict(list)
+    for item in items:
+        groups[key(item)].append(item)
+    return groups
+
+
+def _order(cell: Cell) -> tuple:
+    def rank(value: Any, known: Sequence[Any]) -> tuple[int, Any]:
+        return (list(known).index(value), "") if value in known else (len(known), value)
+
+    variants = tuple((name, repr(value).rjust(20)) for name, value in cell.settings.items())
+    return rank(cell.place, PLACES), cell.stage, rank(cell.method, list(METHODS)), not cell.is_papers, variants
+
+
+def _standing(run: Run) -> str:
+    return f"unfinished, {run.progress:.0%} of the steps" if run.state == "unfinished" else run.state
+
+
+def _seeds(seeds: Iterable[int]) -> str:
+    listed = [str(seed) for seed in seeds]
+    return f"seed{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
+
+
+def _protocol(run: Run) -> str:
+    numbers = run.evaluation
+    return f"{numbers.get('episodes', 'unknown')} episodes of seed {numbers.get('seed', 'unknown')}"
+
+
+def _mixed(name: str, values: Iterable[str]) -> list[str]:
+    found = sorted(set(values))
+    return [f"{name}: {', '.join(found)}"] if len(found) > 1 else []

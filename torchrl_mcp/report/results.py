@@ -1,0 +1,205 @@
+"""What run folders say of themselves: configuration, progress, evaluation and origin."""
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
+
+from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, ORIGIN
+
+MODES = ("deterministic", "stochastic")
+STATES = ("complete", "not evaluated", "unfinished", "damaged")
+
+
+REQUIRED = {
+    "task.name": str,
+    "character.name": str,
+    "method.name": str,
+    "stage.name": str,
+    "seed": int,
+    "training.total_frames": int,
+}
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """A folder that cannot be read, and why."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder whose configuration can be read.
+
+    Attributes:
+        path: The folder.
+        settings: The resolved configuration, flat: ``{"method.name": "mcp", "training.total_frames": 1500000, ...}``.
+        frames: Environment steps taken so far.
+        seconds: Wall time of them.
+        has_episodes: Whether an episode has ended, so that there is a learning curve.
+        evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
+        origin: Commit, choices and machine of its beginning; empty of older runs.
+        fault: What is wrong with its files, or None.
+    """
+
+    path: Path
+    settings: Mapping[str, Any]
+    frames: int = 0
+    seconds: float = 0.0
+    has_episodes: bool = False
+    evaluation: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, Any] = field(default_factory=dict)
+    fault: str | None = None
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Names of task and character."""
+        return self.settings["task.name"], self.settings["character.name"]
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.settings["method.name"]
+
+    @property
+    def stage(self) -> str:
+        """``pretrain`` or ``transfer``."""
+        return self.settings["stage.name"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.settings["seed"]
+
+    @property
+    def total_frames(self) -> int:
+        """Environment steps that it is to take."""
+        return self.settings["training.total_frames"]
+
+    @property
+    def preset(self) -> str:
+        """Preset of its settings, ``unknown`` of runs that did not note it."""
+        return self.origin.get("choices", {}).get("preset", "unknown")
+
+    @property
+    def commit(self) -> str:
+        """Commit of the library that it began with, ``unknown`` of runs that did not note it."""
+        return self.origin.get("commit") or "unknown"
+
+    @property
+    def progress(self) -> float:
+        """Share of its steps that it has taken, at most 1."""
+        return min(1.0, self.frames / self.total_frames)
+
+    @property
+    def state(self) -> str:
+        """One of :data:`STATES`."""
+        if self.fault:
+            return "damaged"
+        if self.frames < self.total_frames:
+            return "unfinished"
+        return "complete" if self.evaluation else "not evaluated"
+
+
+def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
+    """Read the run folders among ``paths`` and at any depth in them, each once, in the order of their names.
+
+    Raises:
+        ValueError: If a path does not exist or holds no run.
+    """
+    folders: dict[Path, Path] = {}
+    for path in paths:
+        found = sorted(_run_folders(path))
+        if not found:
+            raise ValueError(f"{path} holds no run: give folders with {CONFIG} and {METRICS}, or folders of such")
+        for folder in found:
+            folders.setdefault(folder.resolve(), folder)
+    outcomes = [read_run(folder) for folder in folders.values()]
+    runs = [outcome for outcome in outcomes if isinstance(outcome, Run)]
+    return runs, [outcome for outcome in outcomes if isinstance(outcome, Damaged)]
+
+
+def read_run(folder: Path) -> Run | Damaged:
+    """Read a run folder; what is damaged is told, not raised."""
+    try:
+        settings = dict(_leaves(OmegaConf.to_container(OmegaConf.load(folder / CONFIG), resolve=True)))
+    except FileNotFoundError:
+        return Damaged(folder, f"has no {CONFIG}")
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+        return Damaged(folder, f"{CONFIG} cannot be read: {_line(error)}")
+    if unfit := [name for name, kind in REQUIRED.items() if not isinstance(settings.get(name), kind)]:
+        return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
+    if (total := settings["training.total_frames"]) < 1:
+        return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
+    contents: dict[str, Any] = {"settings": settings}
+    faults = []
+    for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (ORIGIN, _origin)):
+        try:
+            contents |= read(folder)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
+            faults.append(f"{file} cannot be read: {_line(error)}")
+    return Run(folder, **contents, fault="; ".join(faults) or None)
+
+
+def _run_folders(path: Path) -> Iterator[Path]:
+    for folder, subfolders, files in os.walk(path):
+        if CONFIG in files or METRICS in files:
+            subfolders.clear()
+            yield Path(folder)
+        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of a nested dictionary with their dotted names."""
+    if not isinstance(value, dict):
+        yield name, value
+        return
+    for key, inner in value.items():
+        yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+
+
+def _progress(folder: Path) -> dict[str, Any]:
+    rows = read_metrics(folder)
+    if not rows:
+        return {}
+    return {
+        "frames": int(rows[-1]["frames"]),
+        "seconds": rows[-1]["seconds"],
+        "has_episodes": any(math.isfinite(row[QUANTITY]) for row in rows),
+    }
+
+
+def _evaluation(folder: Path) -> dict[str, Any]:
+    if not (folder / EVALUATION).exists():
+        return {}
+    content = json.loads((folder / EVALUATION).read_text())
+    for mode in MODES:
+        for value in (content[mode]["normalised_return"], *content[mode]["interval"]):
+            if not math.isfinite(value):
+                raise ValueError(f"the {mode} normalised return is {value}")
+    return {"evaluation": content}
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    if not (folder / ORIGIN).exists():
+        return {}
+    content = json.loads((folder / ORIGIN).read_text())
+    content.get("choices", {}).get("preset")
+    return {"origin": content}
+
+
+def _line(error: Exception) -> str:
+    """The first line of an error's message."""
+    message = str(error).partition("\n")[0] or type(error).__name__
+    return f"it lacks {message}" if isinstance(error, KeyError) else message

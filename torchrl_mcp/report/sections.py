@@ -1,0 +1,247 @@
+"""The parts of a report: cells in tables with their learning curves."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+from torchrl_mcp.analysis.curves import learning_curves, plot_curves
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, new_figure
+from torchrl_mcp.report.comparison import Cell, ablations, caveats
+from torchrl_mcp.report.paper import CHARACTERS, METHODS, SETTINGS
+from torchrl_mcp.report.svg import inline_svg
+from torchrl_mcp.report.usage import diagnostics, usage, verdict
+
+LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS, start=1)}
+PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
+
+METHOD_COLOURS = dict(
+    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=True)
+)
+
+DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
+"""Kinds of lines of matplotlib, and their like in SVG."""
+
+ABLATIONS = {
+    "num_primitives": (
+        "Number of primitives",
+        "Table 4 of the paper, where the humanoid dribbles with 4, 8, 16 and 32.",
+    ),
+    "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper, where both fare alike on most tasks."),
+    "mixer": ("Mixer", "Primitives composed by Eq. 2, multiplicative, or by Eq. 1, additive."),
+    "exploration": ("Exploration", "Over actions, as in Eq. 4, or over the weights of primitives, as in Section 5.3."),
+}
+
+SETTING_WORDS = {
+    "preset": "preset {}",
+    "total_frames": "{:,} steps",
+    "num_primitives": "{} primitives",
+    "num_options": "{} options",
+    "latent_dim": "{} latent variables",
+    "trained": "trained: {}",
+    "mixer": "{} mixer",
+    "exploration": "exploration: {}",
+    "pretrained": "{} pre-training",
+}
+
+DIAGNOSTICS = {
+    "gates": (
+        "Gates",
+        {
+            "effective_primitives": "Effective primitives",
+            "sum": "Sum of weights",
+            "saturation": "Saturated",
+            "entropy": "Entropy, nats",
+        },
+    ),
+    "options": (
+        "Options",
+        {"effective_options": "Effective options", "begin_rate": "Begin rate", "duration": "Duration, steps"},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A cell with its name in a table, and what tells it from others of that name."""
+
+    cell: Cell
+    name: str
+    variant: str = ""
+
+    @property
+    def label(self) -> str:
+        """Both in one line."""
+        return f"{self.name}, {self.variant}" if self.variant else self.name
+
+
+@dataclass(frozen=True)
+class Line:
+    """An entry of a legend: its label and how the line is drawn, in CSS."""
+
+    label: str
+    colour: str
+    dashes: str
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Learning curves, their legend, and the labels of rows in which no episode has ended yet."""
+
+    svg: str
+    lines: Sequence[Line]
+    without: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Cells that are compared with each other, which are a ``kind`` of thing."""
+
+    title: str
+    rows: Sequence[Row]
+    plot: Plot | None = None
+    kind: str = "Method"
+
+    @property
+    def caveats(self) -> list[str]:
+        """What else differs between the cells."""
+        return caveats([row.cell for row in self.rows])
+
+    @property
+    def remarks(self) -> dict[str, list[str]]:
+        """Labels of the rows by what is remarked of them."""
+        found: dict[str, list[str]] = {}
+        for row in self.rows:
+            for remark in row.cell.remarks:
+                found.setdefault(remark, []).append(row.label)
+        return found
+
+    @property
+    def measures(self) -> list[str]:
+        """Names of what the task measures."""
+        return list(dict.fromkeys(name for row in self.rows for name in row.cell.measures))
+
+    @property
+    def has_reported(self) -> bool:
+        """Whether the paper has a figure for one of them."""
+        return any(row.cell.reported for row in self.rows)
+
+    def is_best(self, cell: Cell, mode: str) -> bool:
+        """Whether a cell has the highest mean of at least two."""
+        means = [estimate.value for row in self.rows if (estimate := row.cell.mean(mode))]
+        own = cell.mean(mode)
+        return own is not None and len(means) > 1 and own.value == max(means)
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """An ablation: one section for each task, character and method."""
+
+    title: str
+    explanation: str
+    sections: Sequence[Section]
+
+
+def place_title(place: tuple[str, str]) -> str:
+    """Return ``Dribble: T-Rex`` for ``("dribble", "trex")``."""
+    task, character = place
+    return f"{task.capitalize()}: {CHARACTERS.get(character, character)}"
+
+
+def method_title(method: str) -> str:
+    """Return a method's name in the paper, if it has one."""
+    return METHODS.get(method, method)
+
+
+def row(cell: Cell) -> Row:
+    """Return a cell under the name of its method; settings as in the paper go without saying."""
+    papers = SETTINGS.get(cell.method, {})
+    telling = {name: value for name, value in cell.settings.items() if name not in papers or value != papers[name]}
+    words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in telling.items())
+    return Row(cell, method_title(cell.method), ", ".join(words))
+
+
+def task_sections(cells: Sequence[Cell], names: Iterator[str]) -> list[Section]:
+    """Return a section per task and character, as in Figures 4 and 9.
+
+    The table has all cells; the plot leaves out those that an ablation shows.
+
+    Args:
+        cells: Cells of one stage.
+        names: Names for plots.
+    """
+    ablated = {id(cell) for setting in ABLATIONS for part in ablations(cells, setting) for cell in part.cells}
+    sections = []
+    for place in dict.fromkeys(cell.place for cell in cells):
+        rows = [row(cell) for cell in cells if cell.place == place]
+        drawn = [r for r in rows if r.cell.is_papers or id(r.cell) not in ablated]
+        sections.append(Section(place_title(place), rows, plot(place_title(place), drawn, _styles(drawn), next(names))))
+    return sections
+
+
+def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapter]:
+    """Return what cells say of the ablations, those of which there is something to compare."""
+    chapters = []
+    for setting, (title, explanation) in ABLATIONS.items():
+        sections = []
+        for part in ablations(cells, setting):
+            first = part.cells[0]
+            heading = f"{place_title(first.place)}, {method_title(first.method)}, {first.stage}"
+            rows = [Row(cell, SETTING_WORDS[setting].format(cell.choices[setting])) for cell in part.cells]
+            styles = [{"color": colour, "linestyle": "-"} for colour, _ in zip(cycle(COLOURS), rows, strict=False)]
+            drawn = plot(f"{title}, {heading}", rows, styles, next(names))
+            sections.append(Section(heading, rows, drawn, kind="Setting"))
+        if sections:
+            chapters.append(Chapter(title, explanation, sections))
+    return chapters
+
+
+def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Return what is known of gates and options, a row per cell that has any."""
+    tables = []
+    for group, (title, columns) in DIAGNOSTICS.items():
+        rows = [
+            {
+                "row": row(cell),
+                "numbers": numbers,
+                "usage": [(run.seed, usage(run, group)) for run in cell.complete],
+                "verdicts": [(run.seed, said) for run in cell.complete if (said := verdict(run, group))],
+            }
+            for cell in cells
+            if (numbers := diagnostics(cell, group))
+        ]
+        if rows:
+            tables.append({"title": title, "columns": columns, "rows": rows})
+    return tables
+
+
+def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], name: str) -> Plot | None:
+    """Draw the learning curves of rows, or return None where no episode has ended.
+
+    Args:
+        title: What they share.
+        rows: The rows.
+        styles: ``color`` and ``linestyle`` of each.
+        name: Name of the plot, of which a page has one.
+    """
+    groups = [
+        ([run.path for run in r.cell.runs if run.has_episodes], r.label, s) for r, s in zip(rows, styles, strict=True)
+    ]
+    drawn = [group for group in groups if group[0]]
+    if not drawn:
+        return None
+    figure = new_figure(4.8, 2.8)
+    curves = learning_curves({label: paths for paths, label, _ in drawn})
+    plot_curves(figure.add_subplot(), curves, [{**style, "linewidth": 1.5} for *_, style in drawn])
+    described = f"{title}: normalised return against environment steps, of {'; '.join(curve.label for curve in curves)}"
+    svg = inline_svg(figure, name, described, PAGE_COLOURS)
+    lines = [Line(label, LINES[style["color"]], DASHES[style["linestyle"]]) for _, label, style in drawn]
+    return Plot(svg, lines, [label for paths, label, _ in groups if not paths])
+
+
+def _styles(rows: Sequence[Row]) -> Iterator[dict[str, str]]:
+    """A colour per method, and a kind of line per variant of it."""
+    kinds: dict[str, Iterator[str]] = {}
+    for r in rows:
+        kind = next(kinds.setdefault(r.cell.method, cycle(DASHES)))
+        yield {"color": METHOD_COLOURS.get(r.cell.method, COLOURS[-1]), "linestyle": kind}

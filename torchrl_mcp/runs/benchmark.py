@@ -1,0 +1,250 @@
+"""Benchmarks: many runs of ``torchrl-mcp-train`` by Hydra's launchers, pre-training before what transfers from it.
+
+A benchmark is a file of rows and settings, which are expanded to runs and handed to the configured launcher in batches
+of all that is ready: first pre-training and what needs none, then transfer (Hydra's own sweepers know of no run that
+waits for another). A run is its folder, whose configuration says what it is, so that a benchmark called again passes
+over runs that are complete, goes on with those that are not, and refuses a folder of other settings.
+"""
+
+import fcntl
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from hydra import initialize_config_module
+from hydra._internal.callbacks import Callbacks
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.training.run_folder import CONFIG, LOG
+from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
+
+QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
+TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "pretrained", "transfer.freeze", "transfer.keep"}
+"""Settings that make no difference to pre-training, or that it refuses."""
+INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
+               "progress_bar", "resume", "torch_threads"}  # fmt: skip
+"""Settings that may differ from those that a run began with."""
+
+Settings = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of a benchmark.
+
+    Attributes:
+        folder: Its run folder.
+        overrides: Its command line.
+        config: Its configuration.
+        needs: Folder of the pre-training that must be complete first, if any.
+    """
+
+    folder: Path
+    overrides: list[str]
+    config: dict[str, Any]
+    needs: Path | None = None
+
+    def after(self, pretraining: Path) -> "Job":
+        """Return the job as it transfers from the pre-training in a folder."""
+        config = {**self.config, "pretrained": str(pretraining)}
+        return Job(self.folder, [*self.overrides, f"pretrained={pretraining}"], config, pretraining)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run what is not complete of the benchmark that the command line names, and name what has failed.
+
+    Raises:
+        ValueError: If the arguments fit no row, or a folder holds a run of other settings.
+        SystemExit: If a run has failed.
+    """
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        master = hydra.compose_config("train", [*QUIET, *arguments], RunMode.MULTIRUN, with_log_configuration=False)
+        context = HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(master))
+        jobs = plan(master, hydra.config_loader)
+        if conflicts := [line for job in jobs if (line := conflict(job))]:
+            raise ValueError("\n".join(["nothing was started, for there are runs of other settings:", *conflicts]))
+        launcher = Plugins.instance().instantiate_launcher(context, run, master)
+        runs = {job.folder: job.config["training"]["total_frames"] for job in jobs}
+        name = MANIFEST.format(master.hydra.runtime.choices.benchmark)
+        write_manifest(runs, Path(master.hydra.sweep.dir) / name)
+        with overview(Path(master.run_root), runs):
+            launched = launch(jobs, launcher)
+    if unfinished := [line for job in jobs if (line := outcome(job, launched))]:
+        sys.exit("\n".join(unfinished))
+    print(f"all {len(jobs)} runs are complete: torchrl-mcp-report {master.run_root}")
+
+
+def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
+    """Return all runs of the benchmark ``master.benchmark`` as the command line has it, pre-training first.
+
+    An argument of the command line that rows have as well, such as ``task=heading``, selects rows; any other sets or
+    sweeps a setting of all runs. A run whose method keeps something transfers from the pre-training of the same
+    settings, which others may share.
+
+    Raises:
+        ValueError: If there are none, or two of different settings would share a folder.
+    """
+    params = [f"{key}={value}" for key, value in master.benchmark.get("params", {}).items()]
+    given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
+    overrides = OverridesParser.create(config_loader=loader).parse_overrides([*params, *given])
+    choices = {override.get_key_element(): values(override) for override in overrides}
+    rows: Any = OmegaConf.to_container(master.benchmark.rows)
+    pretraining: dict[tuple[str, ...], Job] = {}
+    transfer: list[Job] = []
+    for settings in expand(rows, choices):
+        job = make_job({**settings, "stage": "transfer"}, master, loader)
+        if job.config["transfer"]["keep"] and not job.config["pretrained"]:
+            needed = pretraining_of(settings, job.config["task"], master.benchmark.get("pretrain_seed"))
+            key = tuple(f"{name}={value}" for name, value in needed.items())
+            pretraining[key] = pretraining.get(key) or make_job(needed, master, loader)
+            job = job.after(pretraining[key].folder)
+        transfer.append(job)
+    if not transfer:
+        raise ValueError(f"no row of the benchmark fits {' '.join(given)}; its rows are\n" + "\n".join(map(str, rows)))
+    jobs = [*pretraining.values(), *transfer]
+    require_own_folders(jobs)
+    return jobs
+
+
+def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> Iterator[Settings]:
+    """Yield every combination of every row, as far as ``choices`` allow, with every combination of the other choices.
+
+    >>> list(expand([{"task": ["heading", "carry"]}], {"task": ["carry"], "seed": ["0", "1"]}))
+    [{'task': 'carry', 'seed': '0'}, {'task': 'carry', 'seed': '1'}]
+    """
+    for row in rows:
+        selected = {key: [value for value in row[key] if value in choices.get(key, row[key])] for key in row}
+        others = {key: choice for key, choice in choices.items() if key not in row}
+        for combination in product(*selected.values(), *others.values()):
+            yield dict(zip([*selected, *others], combination, strict=True))
+
+
+def values(override: Override) -> list[str]:
+    """Return the values that an argument of the command line gives its setting."""
+    if override.is_discrete_sweep():
+        return [str(value) for value in override.sweep_string_iterator()]
+    return [override.get_value_element_as_str()]
+
+
+def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None = None) -> Settings:
+    """Return the settings of the pre-training, with a ``seed`` of its own if given, from which a run transfers.
+
+    Args:
+        settings: Those of the run.
+        task: The configuration of its task.
+        seed: That of the pre-training, if not the run's.
+    """
+    name = task["name"] if "pretrain" in task else "imitation"
+    kept = {
+        key: value
+        for key, value in settings.items()
+        if key not in TRANSFER_ONLY and (name == task["name"] or not key.startswith("task."))
+    }
+    return {**kept, "task": name, "stage": "pretrain"} | ({} if seed is None else {"seed": str(seed)})
+
+
+def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Job:
+    """Return the run of some settings, in the folder that the configuration gives it."""
+    overrides = [f"{key}={value}" for key, value in {**settings, "progress_bar": "false"}.items()]
+    cfg = loader.load_sweep_config(master, overrides)
+    former = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(cfg)  # for what refers to it
+    with read_write(cfg), open_dict(cfg):
+        del cfg["hydra"]
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    HydraConfig.instance().cfg = former
+    return Job(Path(config["run_dir"]), overrides, config)
+
+
+def require_own_folders(jobs: Sequence[Job]) -> None:
+    """Check that no two jobs share a folder.
+
+    Raises:
+        ValueError: If two do.
+    """
+    owners: dict[Path, Job] = {}
+    for job in jobs:
+        if (other := owners.setdefault(job.folder, job)) is not job:
+            changed = ", ".join(differences(other.config, job.config)) or "nothing"
+            raise ValueError(
+                f"two runs, which differ in {changed}, would share the folder {job.folder}: run them one after the "
+                "other, each with a run_root of its own"
+            )
+
+
+def conflict(job: Job) -> str | None:
+    """Return what keeps a job from its folder, if anything."""
+    if not (job.folder / CONFIG).exists():
+        return None
+    held: Any = OmegaConf.to_container(experiment.configuration(job.folder), resolve=True)
+    if not (changed := differences(held, job.config)):
+        return None
+    return f"{job.folder} differs in {', '.join(changed)}: delete it, or choose another run_root"
+
+
+def differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """Return the settings that make two runs differ."""
+    keys = dict.fromkeys([*held, *wanted])
+    return [key for key in keys if key not in INDIFFERENT and held.get(key) != wanted.get(key)]
+
+
+def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
+    """Launch what is not complete, batch by batch as it becomes ready; return what was launched."""
+    launched: list[Job] = []
+    waiting = [job for job in jobs if not is_complete(job.folder)]
+    while ready := [job for job in waiting if job.needs is None or is_complete(job.needs)]:
+        try:
+            launcher.launch([job.overrides for job in ready], initial_job_idx=len(launched))
+        except Exception:  # whatever a launcher raises when a worker dies; the folders say what is done
+            traceback.print_exc()
+        launched += ready
+        waiting = [job for job in waiting if job not in ready]
+    return launched
+
+
+def run(cfg: DictConfig) -> None:
+    """Train as configured, or go on where training stopped, with all that is printed in the run folder's log."""
+    folder = Path(cfg.run_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOG).open("a", buffering=1) as log:
+        # Where another process trains this run, wait for it. The lock also shows that the run is alive.
+        fcntl.flock(log, fcntl.LOCK_EX)
+        with redirect_stdout(log), redirect_stderr(log):
+            try:
+                if (folder / CONFIG).exists():
+                    experiment.resume(folder)
+                else:
+                    experiment.train(cfg)
+            except Exception:
+                traceback.print_exc()
+                raise
+
+
+def is_complete(folder: Path) -> bool:
+    """Tell whether a folder holds a run that has ended and been evaluated."""
+    return (folder / CONFIG).exists() and experiment.is_complete(folder)
+
+
+def outcome(job: Job, launched: Sequence[Job]) -> str | None:
+    """Return why a job is not complete, if it is not."""
+    if is_complete(job.folder):
+        return None
+    if job in launched:
+        return f"failed: {job.folder}, see {job.folder / LOG}"
+    return f"not run: {job.folder}, which needs {job.needs}"

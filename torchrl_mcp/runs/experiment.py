@@ -1,0 +1,255 @@
+"""The life of a run: trained in a folder of its own, resumed, restored, evaluated and published."""
+
+import json
+import math
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+from torchrl.record.loggers.common import Logger
+
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.evaluation.clips import ClipResult, follow_each
+from torchrl_mcp.runs.build import Agent, make_agent, make_source, make_env, make_trainer
+from torchrl_mcp.runs.builtin import builtin, publish
+from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.evaluation.rollout import evaluate, summary
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.runs.provenance import origin
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
+from torchrl_mcp.training.trainer import Trainer
+
+USUAL = ("collector", "evaluation")
+"""Settings that not all runs had from the beginning."""
+
+
+def train(cfg: DictConfig) -> Path:
+    """Train from the start in the run folder ``cfg.run_dir``, evaluate the policy, and return the folder.
+
+    Raises:
+        ValueError: If the folder holds a run already, or the configuration lacks the checkpoint to transfer from.
+    """
+    folder = Path(cfg.run_dir)
+    if (folder / CONFIG).exists():
+        raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    trainer = _trainer(cfg, folder, _pretrained(cfg))
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer.save()
+    _write(origin(cfg.device), folder / ORIGIN)
+    # Last, because it is what says that there is a run to resume.
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    _finish(trainer, cfg, folder)
+    return folder
+
+
+def resume(folder: Path) -> Path:
+    """Continue the run in ``folder`` from its newest checkpoint, with the configuration it began with.
+
+    A run that :func:`is_complete` is left as it is.
+
+    Raises:
+        ValueError: If the folder holds no run, or its checkpoint is damaged.
+    """
+    if is_complete(folder):
+        return folder
+    cfg, newest = configuration(folder), checkpoint.find(folder)
+    if checkpoint.frames(newest):
+        trainer = _trainer(cfg, folder)
+        trainer.restore(newest)
+    else:  # the environments have not been reset yet, so there is no state of theirs to return to
+        trainer = _trainer(cfg, folder, _pretrained(cfg))
+        trainer.metrics_writer.rewind(0)
+    (folder / EVALUATION).unlink(missing_ok=True)
+    _finish(trainer, cfg, folder)
+    return folder
+
+
+def configuration(folder: Path) -> DictConfig:
+    """Return the configuration of the run in ``folder``; if it is from before ``USUAL``, they are as in a new run.
+
+    Raises:
+        ValueError: If the folder holds no run.
+    """
+    if not (folder / CONFIG).is_file():
+        raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
+    cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
+    if missing := [key for key in USUAL if key not in cfg]:
+        usual = _usual(cfg.task.name)
+        cfg.update({key: usual[key] for key in missing})
+    return cfg
+
+
+def is_complete(folder: Path) -> bool:
+    """Tell whether the run in ``folder`` has taken all its steps and has been evaluated.
+
+    Raises:
+        ValueError: If the folder holds no run.
+    """
+    cfg = configuration(folder)
+    trained = checkpoint.frames(checkpoint.find(folder)) >= cfg.training.total_frames
+    return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
+
+
+def restore(
+    path: Path, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
+) -> tuple[DictConfig, Agent, CharacterEnv | TransformedCharacterEnv]:
+    """Return configuration, trained agent and fresh environments from a run folder or checkpoint file.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file. What is published holds no critic,
+            which is then as it was initialised.
+        num_envs: Number of environments.
+        seed: Their seed.
+        device: Where to put the networks.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    file = checkpoint.find(path)
+    cfg = OmegaConf.create(dict(checkpoint.configuration(file)))
+    cfg.device = device
+    env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
+    agent = make_agent(cfg, env)
+    checkpoint.load_agent(agent.parts, file)
+    return cfg, agent, env
+
+
+def publish_run(path: Path, output: Path) -> None:
+    """Write the policy of a run as a checkpoint file of its own, as small as those that come with the library.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        output: The file to write.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    cfg, agent, _ = restore(path, num_envs=1, seed=0)
+    cfg.run_dir = cfg.run_root = "runs"  # where it lay is of no use to others
+    parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
+    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output)
+
+
+def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
+    """Return what ``evaluation.json`` says of a run: :func:`evaluate_run` in the environments of its configuration.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+
+    Returns:
+        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, ``deterministic`` and
+        ``stochastic``.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    cfg = OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
+    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual(cfg.task.name)["evaluation"], resolve=True)
+    environment = settings["environment"]
+    numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
+    return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
+
+
+def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
+    """Return the :func:`~torchrl_mcp.evaluation.rollout.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+
+    Each has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    results = {}
+    for mode in ("deterministic", "stochastic"):
+        _, agent, env = restore(path, num_envs=episodes, seed=seed, **kwargs)
+        torch.manual_seed(seed)
+        record = diagnosed(agent.actor)
+        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
+        results[mode] = summary(outcome, env.normalised_return)
+        results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
+    return results
+
+
+def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
+    """Return how well a run's policy follows each of its reference motions, when it plays deterministic actions.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        episodes: Episodes per clip.
+        seed: Seed of environments.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+    """
+    _, _, env = restore(path, num_envs=1, seed=seed)
+    if not hasattr(env, "library"):
+        raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
+    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, switch_interval=math.inf)
+    return follow_each(agent.actor.policy, env)
+
+
+def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> Trainer:
+    if cfg.torch_threads:
+        torch.set_num_threads(cfg.torch_threads)
+    torch.manual_seed(cfg.seed)
+    source = make_source(cfg)
+    agent = make_agent(cfg, source.env, pretrained)
+    return make_trainer(cfg, agent, source, folder)
+
+
+def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
+    """Train to the end and evaluate what came of it."""
+    trainer.metrics_writer.loggers = _loggers(cfg)
+    trainer.run()
+    if cfg.evaluation.episodes:
+        numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
+        _write(numbers, folder / EVALUATION)
+
+
+def _usual(task: str) -> dict[str, DictConfig]:
+    """Return what a new run on a task has of ``USUAL``."""
+    begun = GlobalHydra.instance().is_initialized()  # on the command line
+    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        cfg = compose("train", [f"task={task}"])
+        return {key: cfg[key] for key in USUAL}
+
+
+def _write(content: dict[str, Any], path: Path) -> None:
+    """Write a JSON file that is whole if it is there."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(content, indent=2) + "\n")
+    part.replace(path)
+
+
+def _loggers(cfg: DictConfig) -> list[Logger]:
+    return [instantiate(cfg.logger)] if cfg.logger else []
+
+
+def _pretrained(cfg: DictConfig) -> Path | None:
+    """Return the checkpoint file to begin from, or None to begin from nothing."""
+    transfers = cfg.stage.name == "transfer"
+    if (transfers and not cfg.transfer.keep) or (not transfers and cfg.pretrained is None):
+        return None
+    if cfg.pretrained is None:
+        raise ValueError(
+            f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
+            "give its run folder as pretrained=<folder>"
+        )
+    if cfg.pretrained == "builtin":
+        return builtin(cfg.method.name, cfg.character.name)
+    return checkpoint.find(Path(cfg.pretrained))

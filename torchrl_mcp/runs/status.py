@@ -1,0 +1,202 @@
+"""How far are the runs of a folder?
+
+Everything is read from the run folders, so it works beside a sweep in any process on any machine that shares them.
+"""
+
+import csv
+import fcntl
+import json
+import os
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS
+
+MANIFEST = "benchmark-{}.json"
+STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
+INTERVAL = 1.0
+"""Seconds between looks at the folders."""
+
+Runs = Mapping[Path, int | None]
+"""Run folders and their environment steps in all, None for those of their configuration."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a run is.
+
+    Attributes:
+        folder: Its run folder.
+        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), or ``done``.
+        frames: Environment steps so far.
+        total: Environment steps in all.
+        speed: Environment steps per second, of the last iteration.
+        normalised_return: That of the evaluation, or of training as long as there is none; None if there is neither.
+    """
+
+    folder: Path
+    state: str
+    frames: int
+    total: int
+    speed: float = 0.0
+    normalised_return: float | None = None
+
+    @property
+    def remaining(self) -> float | None:
+        """Seconds to the end of training, or None where nobody knows."""
+        return (self.total - self.frames) / self.speed if self.state == "running" and self.speed else None
+
+
+@contextmanager
+def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
+    """Show how far ``runs`` are, or all of a folder, while the block runs: a table, or where there is none, lines."""
+    console = Console(file=sys.stdout)
+    if console.is_terminal:
+        with Live(
+            get_renderable=lambda: table(look(folder, runs), folder, console.height - 4),
+            console=console,
+            refresh_per_second=1 / INTERVAL,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        ):
+            yield
+        return
+    ended = threading.Event()
+    thread = threading.Thread(target=_tell, args=(folder, runs, ended), daemon=True)
+    thread.start()
+    yield
+    ended.set()
+    thread.join()
+
+
+def look(folder: Path, runs: Runs | None = None) -> list[Status]:
+    """Return how far ``runs`` are, or else all that lie in ``folder`` or that benchmarks there have planned."""
+    if runs is None:
+        found: dict[Path, int | None] = {path.parent.resolve(): None for path in sorted(folder.rglob(CONFIG))}
+        for path in sorted(folder.rglob(MANIFEST.format("*"))):
+            found |= read_manifest(path)
+        runs = found
+    return [status(run, total) for run, total in runs.items()]
+
+
+def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
+    """Write down which runs a benchmark has and how many steps each takes, for those who look on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
+    path.write_text(json.dumps(steps, indent=2) + "\n")
+
+
+def read_manifest(path: Path) -> dict[Path, int]:
+    """Return which runs a benchmark has and how many steps each takes."""
+    return {(path.parent / run).resolve(): total for run, total in json.loads(path.read_text()).items()}
+
+
+def status(run: Path, total: int | None = None) -> Status:
+    """Return how far the run in a folder is, of ``total`` environment steps or those of its configuration."""
+    total = _plan(run)[0] if total is None else total
+    last = _last_row(run / METRICS)
+    frames = int(last.get("frames", 0))
+    speed, score = last.get("time/steps_per_second", 0.0), last.get("episode/normalised_return")
+    if (run / EVALUATION).exists():
+        evaluation = json.loads((run / EVALUATION).read_text())
+        return Status(run, "done", frames, total, speed, evaluation["deterministic"]["normalised_return"])
+    if _is_locked(run / LOG):
+        return Status(run, "running", frames, total, speed, score)
+    if frames >= total and not _plan(run)[1]:
+        return Status(run, "done", frames, total, speed, score)
+    return Status(run, "stopped" if (run / LOG).exists() or frames else "waiting", frames, total, speed, score)
+
+
+def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -> Table:
+    """Return a table of runs, those first that want to be seen, of at most ``height`` rows."""
+    order = list(STYLES)
+    rows = sorted(statuses, key=lambda one: order.index(one.state))
+    shown = rows if height is None or len(rows) <= height else rows[: max(height, 1)]
+    hidden = f"; {len(rows) - len(shown)} not shown" if len(shown) < len(rows) else ""
+    result = Table(caption=_count(statuses) + hidden, caption_justify="left", box=None, padding=(0, 2, 0, 0))
+    result.add_column("run", overflow="fold")
+    result.add_column("state")
+    for name in ("steps", "steps/s", "return", "left"):
+        result.add_column(name, justify="right", no_wrap=True)
+    for one in shown:
+        result.add_row(_name(one.folder, folder), *_cells(one), style=STYLES[one.state])
+    return result
+
+
+def _tell(folder: Path, runs: Runs | None, ended: threading.Event) -> None:
+    """Print a line whenever a run changes its state."""
+    terminal = sys.stdout  # which runs in this process replace by their log
+    known: dict[Path, str] = {}
+    last = False
+    while not last:
+        last = ended.wait(INTERVAL)
+        statuses = look(folder, runs)
+        for one in statuses:
+            if known.get(one.folder, "waiting") != one.state:
+                state, *cells = _cells(one)
+                line = f"{time.strftime('%H:%M:%S')} {state:8} {_name(one.folder, folder)} {' '.join(cells[:3])}"
+                print(f"{line} ({_count(statuses)})", file=terminal, flush=True)
+            known[one.folder] = one.state
+
+
+def _cells(one: Status) -> tuple[str, ...]:
+    steps = f"{one.frames:,}/{one.total:,}"
+    speed = f"{one.speed:,.0f}" if one.state == "running" and one.speed else "-"
+    score = "-" if one.normalised_return is None else f"{one.normalised_return:.3f}"
+    left = "-" if one.remaining is None else f"{one.remaining / 60:.0f} min"
+    return one.state, steps, speed, score, left
+
+
+def _count(statuses: Sequence[Status]) -> str:
+    numbers = Counter(one.state for one in statuses)
+    return ", ".join(f"{numbers[state]} {state}" for state in STYLES if numbers[state])
+
+
+def _name(run: Path, folder: Path) -> str:
+    return os.path.relpath(run, folder)
+
+
+@cache
+def _plan(run: Path) -> tuple[int, int]:
+    """Return the environment steps of a run that has begun, and the episodes of the evaluation after them."""
+    cfg = OmegaConf.load(run / CONFIG)
+    return cfg.training.total_frames, OmegaConf.select(cfg, "evaluation.episodes", default=0)
+
+
+def _last_row(path: Path) -> dict[str, float]:
+    """Return the last whole row of a CSV file of numbers, or nothing."""
+    if not path.exists():
+        return {}
+    with path.open("rb") as file:
+        names = file.readline().decode().strip()
+        file.seek(max(file.tell(), path.stat().st_size - 2 * (len(names) + 2000)))
+        lines = file.read().decode().splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("\n") and line.count(",") == names.count(",")]
+    if not whole:
+        return {}
+    row = next(csv.DictReader([names, whole[-1]]))
+    return {name: float(value) for name, value in row.items()}
+
+
+def _is_locked(path: Path) -> bool:
+    """Tell whether a process trains the run whose log this is."""
+    if not path.exists():
+        return False
+    with path.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False

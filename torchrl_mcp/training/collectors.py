@@ -1,0 +1,270 @@
+"""Where trajectories come from: environments in this process, or in workers on one machine or on many."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.collectors import Collector
+
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.training.progress import Stopwatch
+
+Environments = CharacterEnv | TransformedCharacterEnv
+
+
+class TrajectorySource(Protocol):
+    """What the trainer asks for trajectories.
+
+    Attributes:
+        env: Environments like those that are stepped, of any number.
+        num_envs: Number of environments that are stepped, ``N``.
+        resumes_episodes: Whether a resumed run goes on within its episodes, or begins new ones.
+    """
+
+    env: Environments
+    num_envs: int
+    resumes_episodes: bool
+
+    def start(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        device: torch.device,
+        autocast: bool,
+        stopwatch: Stopwatch,
+    ) -> None:
+        """Get ready to act by ``policy``, ``N * T = frames_per_batch`` steps at a time."""
+        ...
+
+    def collect(self) -> TensorDictBase:
+        """Return the next trajectories ``(N, T)`` on the device of the start, and time them."""
+        ...
+
+    def metrics(self) -> dict[str, float]:
+        """Return what is worth recording of the environments themselves."""
+        ...
+
+    def stop(self) -> None:
+        """Release what :meth:`start` has taken."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave, before the start."""
+        ...
+
+
+class LocalSource:
+    """Steps environments of this process.
+
+    Their state is its own, so that a resumed run goes on within their episodes, to the same numbers.
+
+    Args:
+        env: Environments, batch size ``[N]``, with or without transforms.
+    """
+
+    resumes_episodes = True
+
+    def __init__(self, env: Environments) -> None:
+        self.env = env
+        self.num_envs: int = env.batch_size[0]
+
+    def start(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        device: torch.device,
+        autocast: bool,
+        stopwatch: Stopwatch,
+    ) -> None:
+        """Set up TorchRL's collector."""
+        self._stopwatch = stopwatch
+        self._precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=autocast)
+        stopwatch.watch("forward", policy)
+        random = GlobalRNGState().state_dict()
+        self._collector = Collector(
+            self.env,
+            policy,
+            frames_per_batch=frames_per_batch,
+            total_frames=-1,
+            env_device="cpu",
+            policy_device=device,
+            storing_device=device,
+            auto_register_policy_transforms=False,
+            track_traj_ids=False,
+        )
+        # Setting up a collector draws random numbers, which a resumed run must not notice.
+        GlobalRNGState().load_state_dict(random)
+        self._batches = iter(self._collector)
+
+    def collect(self) -> TensorDictBase:
+        """Return the next trajectories; the time goes to ``physics`` and ``forward``."""
+        before = self.env.physics_seconds
+        with self._precision(), _one_thread():
+            batch = next(self._batches)
+        self._stopwatch.add("physics", self.env.physics_seconds - before)
+        return batch
+
+    def metrics(self) -> dict[str, float]:
+        """Return the number of simulations that became unstable so far."""
+        return {"episode/faults": self.env.num_diverged}
+
+    def stop(self) -> None:
+        """Shut the collector down, and the environments with it."""
+        self._collector.shutdown()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the environments."""
+        return self.env.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the state of the environments."""
+        self.env.load_state_dict(state)
+
+
+def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) -> LocalSource:
+    """Return a collection in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
+    return LocalSource(make_env(num_envs=num_envs, seed=seed))
+
+
+class RemoteSource:
+    """Steps environments in workers, which TorchRL starts by one of its backends, with the newest weights every time.
+
+    A resumed run begins new episodes, other ones than those that it began with.
+
+    Args:
+        make_env: Called in each worker as ``make_env(num_envs=, seed=, num_threads=)`` for environments; picklable.
+        num_envs: Number of environments of all workers together, ``N``.
+        seed: Seed of environments and exploration, from which each worker derives one of its own.
+        num_workers: Number of workers.
+        num_threads: Of each worker's physics.
+        backend: Of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``, ``rpc`` or
+            ``submitit``.
+        backend_options: Its options.
+
+    Raises:
+        ValueError: If the environments do not divide evenly, or Ray is not installed.
+    """
+
+    resumes_episodes = False
+
+    def __init__(
+        self,
+        make_env: Callable[..., Environments],
+        *,
+        num_envs: int,
+        seed: int,
+        num_workers: int,
+        num_threads: int = 1,
+        backend: str = "process",
+        backend_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        if num_envs % num_workers:
+            raise ValueError(f"num_envs={num_envs} must be a multiple of num_workers={num_workers}")
+        if backend == "ray" and find_spec("ray") is None:
+            raise ValueError("collector=ray needs Ray: pip install 'torchrl-mcp[ray]'")
+        self.env = make_env(num_envs=1, seed=seed)
+        self.num_envs, self.num_workers, self.seed = num_envs, num_workers, seed
+        self._make_env = partial(_begin_worker, make_env, num_envs=num_envs // num_workers, num_threads=num_threads)
+        self._backend = {"backend": backend, "backend_options": dict(backend_options or {})}
+        self._starts = 0
+
+    def start(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        device: torch.device,
+        autocast: bool,
+        stopwatch: Stopwatch,
+    ) -> None:
+        """Start the workers."""
+        self._stopwatch, self._device, self._steps = stopwatch, device, frames_per_batch // self.num_envs
+        seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
+        self._starts += 1
+        random = GlobalRNGState().state_dict()
+        self._collector = Collector(
+            [partial(self._make_env, seed=int(seed)) for seed in seeds],
+            _Autocast(policy, device) if autocast else policy,
+            num_collectors=self.num_workers,
+            sync=True,
+            frames_per_batch=frames_per_batch,
+            total_frames=frames_per_batch * 10**9,  # not all backends know of an endless collection
+            env_device="cpu",
+            policy_device=device,
+            storing_device=device,
+            **self._backend,
+        )
+        GlobalRNGState().load_state_dict(random)
+        self._batches: Iterator[TensorDictBase] | None = None
+
+    def collect(self) -> TensorDictBase:
+        """Return the next trajectories, of the newest weights; the time goes to ``collection``."""
+        with self._stopwatch("collection"):
+            self._collector.update_policy_weights_()
+            self._batches = self._batches or iter(self._collector)
+            return next(self._batches).reshape(self.num_envs, self._steps).to(self._device)
+
+    def metrics(self) -> dict[str, float]:
+        """Return nothing: the environments are elsewhere."""
+        return {}
+
+    def stop(self) -> None:
+        """Stop the workers."""
+        self._collector.shutdown()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return how often the workers have been started."""
+        return {"starts": self._starts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore how often they have been started, so that they begin with other episodes."""
+        self._starts = state["starts"]
+
+
+class _Autocast(TensorDictModuleBase):
+    """A policy in bfloat16 autocast, wherever it is called."""
+
+    def __init__(self, policy: TensorDictModuleBase, device: torch.device) -> None:
+        super().__init__()
+        self.policy, self.device_type = policy, device.type
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Act."""
+        with torch.autocast(self.device_type, torch.bfloat16):
+            return self.policy(tensordict)
+
+
+def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **settings: int) -> Environments:
+    """Return the environments of a worker, in its process, whose exploration is its own."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    return make_env(seed=seed, **settings)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch to the calling thread, and the processors to physics.
+
+    OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step takes.
+    """
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(num_threads)

@@ -1,0 +1,276 @@
+"""The training loop: collect, estimate advantages, update, record. One loop for every method."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical, Distribution
+from torch.optim import Optimizer
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.objectives import KLAdaptiveLR, LossModule
+from tqdm import tqdm
+
+from torchrl_mcp.evaluation.diagnostics import diagnostics
+from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.modules import RunningNormaliser
+from torchrl_mcp.training.checkpoint import load, run_checkpoint
+from torchrl_mcp.training.collectors import TrajectorySource
+from torchrl_mcp.training.episodes import EpisodeStatistics
+from torchrl_mcp.training.metrics import MetricsWriter
+from torchrl_mcp.training.progress import Progress, Stopwatch
+from torchrl_mcp.training.transfer import FrozenParts
+
+
+class Estimator(Protocol):
+    """What makes samples for the loss from trajectories."""
+
+    out_keys: Sequence[NestedKey]
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the samples to learn from, with ``out_keys``, of trajectories ``(N, T)``."""
+        ...
+
+
+class Trainer:
+    """Policy optimisation of an actor and a critic.
+
+    Args:
+        source: Where trajectories come from, of ``N`` environments.
+        parts: All parts of the agent by name.
+        actor: The actor over those parts.
+        critic: The value function over those parts.
+        loss: Their loss; every output whose name begins with ``loss_`` is minimised.
+        advantages: From trajectories ``(N, T)`` to the samples to learn from, of any batch shape, with the keys
+            ``advantages.out_keys`` that the loss reads beside what the policy stores.
+        optimizers: Optimisers of all that is trained: of the ``critic``, and of the ``actor`` unless it is frozen.
+        frozen: Parts that must not change, checked in every iteration.
+        metrics_writer: Where metrics go.
+        checkpoints: Where checkpoints go.
+        config: The run's configuration, JSON-compatible, kept in every checkpoint.
+        total_frames: Environment steps of the run.
+        frames_per_batch: Environment steps per iteration, ``N * T``.
+        minibatch_size: Samples per gradient step.
+        num_epochs: Passes over each batch.
+        max_grad_norm: Largest gradient norm, of actor and critic each.
+        step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
+        autocast: Run all networks in bfloat16 autocast, in source and loss alike.
+        device: Where the networks are; physics stays on the CPU.
+        checkpoint_interval: Iterations between checkpoints.
+        progress_bar: Show a progress bar.
+
+    Raises:
+        ValueError: If the batch does not divide evenly.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: TrajectorySource,
+        parts: nn.ModuleDict,
+        actor: Actor,
+        critic: TensorDictModuleBase,
+        loss: LossModule,
+        advantages: Estimator,
+        optimizers: Mapping[str, Optimizer],
+        frozen: FrozenParts,
+        metrics_writer: MetricsWriter,
+        checkpoints: CheckpointRotation,
+        config: dict[str, Any],
+        total_frames: int,
+        frames_per_batch: int,
+        minibatch_size: int,
+        num_epochs: int,
+        max_grad_norm: float,
+        step_size_schedule: Callable[[Optimizer], KLAdaptiveLR] | None,
+        autocast: bool,
+        device: torch.device | str,
+        checkpoint_interval: int,
+        progress_bar: bool = True,
+    ) -> None:
+        num_envs = source.num_envs
+        if frames_per_batch % num_envs or frames_per_batch % minibatch_size:
+            raise ValueError(
+                f"frames_per_batch={frames_per_batch} must be a multiple of num_envs={num_envs} and of "
+                f"minibatch_size={minibatch_size}"
+            )
+        self.source, self.parts, self.actor, self.critic, self.loss = source, parts, actor, critic, loss
+        self.advantages = advantages
+        self.optimizers = dict(optimizers)
+        self.schedule = (
+            step_size_schedule(optimizers["actor"]) if step_size_schedule and "actor" in optimizers else None
+        )
+        self.frozen, self.metrics_writer, self.checkpoints, self.config = frozen, metrics_writer, checkpoints, config
+        self.total_frames, self.frames_per_batch = total_frames, frames_per_batch
+        self.minibatch_size, self.num_epochs, self.max_grad_norm = minibatch_size, num_epochs, max_grad_norm
+        self.device, self.autocast = torch.device(device), autocast
+        self.checkpoint_interval, self.progress_bar = checkpoint_interval, progress_bar
+        self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(num_envs), Stopwatch()
+        self.checkpoint: Checkpoint = run_checkpoint(
+            parts,
+            **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()},
+            environment=source,
+            episodes=self.episodes,
+            frozen=frozen,
+            progress=self.progress,
+            random=GlobalRNGState(),
+        )
+
+    def run(self) -> None:
+        """Train until ``total_frames``, saving as it goes."""
+        self.source.start(
+            self._behaviour(),
+            frames_per_batch=self.frames_per_batch,
+            device=self.device,
+            autocast=self.autocast,
+            stopwatch=self.stopwatch,
+        )
+        with tqdm(
+            total=self.total_frames, initial=self.progress.frames, unit="step", disable=not self.progress_bar
+        ) as bar:
+            while self.progress.frames < self.total_frames:
+                start = time.perf_counter()
+                self.stopwatch.seconds.clear()
+                batch = self.source.collect()
+                metrics = self._episode_metrics(batch) | diagnostics(self.actor, batch)
+                with self.stopwatch("update"):
+                    with self._precision():
+                        samples = self.advantages(batch)
+                    metrics |= self._update(samples)
+                self._update_normalisers(batch)
+                self.frozen.verify()
+                self._advance(metrics, time.perf_counter() - start)
+                bar.set_postfix_str(self._summary(metrics), refresh=False)
+                bar.update(batch.numel())
+        self.source.stop()
+
+    def restore(self, path: Path) -> None:
+        """Continue from the checkpoint file ``path``; where the collection's state is all in it, to the same numbers.
+
+        Raises:
+            ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
+        """
+        load(self.checkpoint, path)
+        if not self.source.resumes_episodes:
+            self.episodes = EpisodeStatistics(self.source.num_envs)
+        self.metrics_writer.rewind(self.progress.iteration)
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
+
+    def _behaviour(self) -> TensorDictModuleBase:
+        """Return the policy as it collects: what it writes is what the loss reads, and no more."""
+        kept = {"action", self.actor.log_prob, *self.actor.stored}
+        keys = [key for key in dict.fromkeys(self.actor.policy.out_keys) if key in kept]
+        return TensorDictSequential(self.actor.policy, selected_out_keys=keys)
+
+    def _update(self, samples: TensorDictBase) -> dict[str, float]:
+        """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports."""
+        keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
+        samples = samples.select(*keys, *self.advantages.out_keys).flatten()
+        reports: list[TensorDictBase] = []
+        for _ in range(self.num_epochs):
+            order = torch.randperm(samples.shape[0], device=samples.device)
+            for index in order.split(self.minibatch_size):
+                with self._precision():
+                    report = self.loss(samples[index])
+                sum(value for key, value in report.items() if key.startswith("loss_")).backward()
+                for name, optimizer in self.optimizers.items():
+                    report.set(f"{name}_grad_norm", self._step(optimizer))
+                reports.append(report.detach())
+        metrics = {f"loss/{key}": value for key, value in _mean(reports).items()}
+        last = _mean(reports[-len(reports) // self.num_epochs :])
+        if "mean_ratio" in last:
+            # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
+            metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
+        self._require_finite(metrics)
+        if self.schedule:
+            self.schedule.step(metrics["loss/kl"])
+        if "actor" in self.optimizers:
+            metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
+        with torch.no_grad(), self._precision():
+            distribution = self.actor.trained.get_dist(samples[: self.minibatch_size])
+        return metrics | _spread(distribution)
+
+    def _step(self, optimizer: Optimizer) -> Tensor:
+        """Clip the gradient, step, and give the gradient's norm."""
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        return norm
+
+    def _require_finite(self, metrics: dict[str, float]) -> None:
+        for key, value in metrics.items():
+            if not abs(value) < float("inf"):
+                raise FloatingPointError(
+                    f"{key} became {value} in iteration {self.progress.iteration + 1}. The last checkpoint, "
+                    f"{self.checkpoints.latest()}, is from before; try a smaller step size or max_grad_norm"
+                )
+
+    def _update_normalisers(self, batch: TensorDictBase) -> None:
+        """Merge the batch into the input statistics, after the update so that source and loss saw the same."""
+        for key in ("observation", "goal"):
+            if (name := f"{key}_normaliser") not in self.frozen:
+                cast("RunningNormaliser", self.parts[name]).update(batch[key])
+
+    def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
+        returns, lengths = self.episodes.update(batch)
+        return {
+            "episode/count": len(returns),
+            "episode/return": returns.mean().item(),
+            "episode/normalised_return": self.source.env.normalised_return(returns).mean().item(),
+            "episode/length": lengths.mean().item(),
+            **self.source.metrics(),
+            "reward": batch["next", "reward"].mean().item(),
+            **self._task_metrics(batch),
+        }
+
+    def _task_metrics(self, batch: TensorDictBase) -> dict[str, float]:
+        """Mean of all that the task observes for the record."""
+        metrics: dict[str, float] = {}
+        for key, names in self.source.env.metric_names.items():
+            means = batch["next", key].float().flatten(0, -2).mean(0)
+            metrics |= {f"task/{name}": mean for name, mean in zip(names, means.tolist(), strict=True)}
+        return metrics
+
+    def _advance(self, metrics: dict[str, float], seconds: float) -> None:
+        """Count, record, and save if it is time."""
+        progress = self.progress
+        progress.iteration += 1
+        progress.frames += self.frames_per_batch
+        progress.seconds += seconds
+        shares = {section: spent / seconds for section, spent in self.stopwatch.seconds.items()}
+        shares["other"] = 1 - sum(shares.values())
+        metrics |= {f"time/{section}": share for section, share in shares.items()}
+        metrics["time/steps_per_second"] = self.frames_per_batch / seconds
+        self.metrics_writer.write(vars(progress) | metrics, step=progress.frames)
+        if progress.iteration % self.checkpoint_interval == 0 or progress.frames >= self.total_frames:
+            self.save()
+
+    def _summary(self, metrics: dict[str, float]) -> str:
+        shares = " ".join(
+            f"{section} {metrics[f'time/{section}']:.0%}" for section in (*self.stopwatch.seconds, "other")
+        )
+        return f"return {metrics['episode/normalised_return']:.3f} | {shares}"
+
+    def _precision(self) -> torch.autocast:
+        # Entered anew for every use: within one context autocast keeps its copies of the weights.
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
+
+
+def _spread(distribution: Distribution) -> dict[str, float]:
+    """How much a policy explores."""
+    if isinstance(distribution, Categorical):
+        return {"policy/entropy": distribution.entropy().mean().item()}
+    return {"policy/std": distribution.stddev.mean().item()}
+
+
+def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
+    """Average scalars over reports of the same keys."""
+    return {key: torch.stack([report[key] for report in reports]).mean().item() for key in reports[0].keys()}  # noqa: SIM118

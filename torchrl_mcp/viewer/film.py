@@ -1,0 +1,159 @@
+"""Films of policies at work."""
+
+import math
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs.rendering import Camera
+from torchrl_mcp.envs.scenery import softly_lit
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.viewer.bars import draw_bars
+from torchrl_mcp.viewer.player import Player
+
+EVERY = {".gif": 2, ".mp4": 1}
+"""Control steps per picture, by the file's suffix."""
+
+COLOURS = 64
+"""Of a picture in a GIF: with as many it is half as large as with 256. An octree keeps the colours of small parts."""
+
+AZIMUTH, ELEVATION = 115.0, -26.0
+"""Degrees. Who walks along x is seen from the right and a little from the front, and no horizon is in sight."""
+
+DISTANCE = 2.8
+"""Of the camera, in reaches of the character."""
+
+LAG = 0.25
+"""Seconds by which the camera is behind what it follows."""
+
+
+def film(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
+    """Play, and draw the character, what its task is about, and the weights of its primitives.
+
+    The camera follows smoothly, and cuts where an episode begins.
+
+    Args:
+        player: Whom to film.
+        seconds: Duration.
+        width: Pixels.
+        height: Pixels.
+        every: Control steps per picture.
+
+    Yields:
+        RGB pictures.
+
+    Raises:
+        RuntimeError: If no OpenGL library for drawing without a display is found.
+    """
+    timestep, model = player.env.control_timestep, softly_lit(player.env.simulation.model)
+    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.reach
+    camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
+    camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
+    camera.view.lookat = player.data.subtree_com[1]
+    fixed = model.light_bodyid == 0  # such lights come along, for shadows are drawn near where they shine
+    try:
+        for step in range(round(seconds / timestep)):
+            player.step()
+            data = player.data
+            centre = data.subtree_com[1]
+            camera.view.lookat = centre if player.began else followed(camera.view.lookat, centre, timestep)
+            data.light_xpos[fixed, :2] += centre[:2]
+            if step % every == every - 1:
+                picture = Image.fromarray(camera.picture(data, distance=distance, shapes=player.shapes).numpy())
+                if player.weights is not None:
+                    draw_bars(picture, player.weights.values, player.weights.title)
+                yield picture
+    finally:
+        camera.close()
+
+
+def followed(place: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
+    r"""Return where the camera looks a while later, each ``(3,)``: :math:`x + (1 - e^{-t / \tau}) (x^* - x)`.
+
+    A target of constant velocity v it follows at the distance :math:`v \tau`, with :math:`\tau` :data:`LAG`.
+    """
+    return place + (1 - math.exp(-seconds / LAG)) * (target - place)
+
+
+def save_film(
+    policy: TensorDictModuleBase,
+    env: CharacterEnv | TransformedCharacterEnv,
+    path: Path,
+    *,
+    seconds: float = 8.0,
+    width: int = 320,
+    height: int = 240,
+    deterministic: bool = True,
+    num_options: int = 0,
+    aside: float = 1.0,
+) -> None:
+    """Write :func:`film` as an animated GIF or an MP4 that plays at the speed of the simulation.
+
+    Args:
+        policy: From what the environment shows to ``action``, on the CPU.
+        env: Environments, of which the first is filmed; an episode that ends is followed by another.
+        path: The file, ``.gif`` or ``.mp4``.
+        seconds: Duration.
+        width: Pixels.
+        height: Pixels.
+        deterministic: Play the deterministic action rather than a sample.
+        num_options: Number of options among which the policy chooses, 0 if it does not.
+        aside: How far beside the character to draw a ghost, in units of the character's reach.
+
+    Raises:
+        RuntimeError: If no OpenGL library for drawing without a display is found.
+        ValueError: If an argument is out of range, the file's suffix is another, or it is ``.mp4`` and what writes
+            that is not installed.
+    """
+    if path.suffix not in EVERY:
+        raise ValueError(f"{path} is no film: call it .gif or .mp4")
+    save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
+    every = EVERY[path.suffix]
+    interval = every * player.env.control_timestep
+    if round(seconds / player.env.control_timestep) < every:
+        raise ValueError(f"seconds={seconds} leaves no time for a picture: pass at least {interval:.2f}")
+    if width < 2 or height < 2:
+        raise ValueError(f"width={width} and height={height} are no size of a picture: pass at least 2 pixels each")
+    pictures = film(player, seconds=seconds, width=width, height=height, every=every)
+    save(pictures, path, interval=interval)
+
+
+def save_gif(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
+    """Write RGB pictures as an animated GIF, one every ``interval`` seconds."""
+    octree, plain = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+    first, *others = (picture.quantize(COLOURS, octree, dither=plain) for picture in pictures)
+    # A GIF counts in hundredths of a second: what is rounded off one picture is added to the next.
+    ticks = [round(100 * interval * number) for number in range(len(others) + 2)]
+    durations = [10 * (end - begin) for begin, end in pairwise(ticks)]
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def save_mp4(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
+    """Write RGB pictures as an MP4 (H.264), one every ``interval`` seconds.
+
+    Raises:
+        ValueError: If imageio-ffmpeg is not installed.
+    """
+    try:
+        ffmpeg = import_module("imageio_ffmpeg")
+    except ImportError as error:
+        raise ValueError(f"{path} needs imageio-ffmpeg: pip install 'torchrl-mcp[video]', or write a .gif") from error
+    writer = None
+    for picture in pictures:
+        if writer is None:
+            # H.264 halves the resolution of colours: the sizes must be even.
+            writer = ffmpeg.write_frames(str(path), picture.size, fps=1 / interval, macro_block_size=2)
+            writer.send(None)
+        writer.send(np.asarray(picture))
+    if writer is not None:
+        writer.close()
