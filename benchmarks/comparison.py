@@ -74,7 +74,7 @@ def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> d
         "steps": run.frames,
         "mode": mode,
         **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
-        **{key: value for key, value in numbers["measures"].items() if not key.startswith("reward_")},
+        **{key: value for key, value in numbers["metrics"].items() if not key.startswith("reward_")},
         "episodes": numbers["episodes"],
         "paper": paper(cell),
         "seconds": round(run.seconds),

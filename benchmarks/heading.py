@@ -98,7 +98,7 @@ def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
     cost = {"frames": int(last["frames"]), "training_seconds": round(last["seconds"])}
     machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
     for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
-        del numbers["measures"], numbers["diagnostics"]
+        del numbers["metrics"], numbers["diagnostics"]
         yield facts | cost | {"mode": mode} | numbers | machine
 
 

@@ -164,7 +164,7 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
         raise ValueError(f"{path} {run.reason}")
     numbers = experiment.evaluate_run(path, episodes=episodes, seed=12345)
     for values in numbers.values():
-        del values["measures"], values["diagnostics"]
+        del values["metrics"], values["diagnostics"]
     facts = {
         "contender": name,
         "label": contender.label,

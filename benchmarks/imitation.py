@@ -127,7 +127,7 @@ def evaluate(run: Path, episodes: int, candidates: int) -> dict[str, dict[str, f
     evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **changing)
     for numbers in evaluation.values():
         numbers["completed"] = 1 - numbers.pop("terminated")
-        numbers["tracking_error"] = numbers.pop("measures")["tracking_error"]
+        numbers["tracking_error"] = numbers.pop("metrics")["tracking_error"]
         del numbers["diagnostics"]
     return evaluation
 

@@ -42,7 +42,7 @@ def main() -> None:
             f"  {mode:13} normalised return {numbers['normalised_return']:.3f} "
             f"(95 % interval of the mean {low:.3f} to {high:.3f}, std {numbers['normalised_return_std']:.3f}), "
             f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
-            + "".join(f", {name} {value:.3f}" for name, value in numbers["measures"].items())
+            + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
         for name, value in numbers["diagnostics"].items():
             print(f"    {name:26} {value:.3f}")

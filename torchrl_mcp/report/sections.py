@@ -117,9 +117,9 @@ class Section:
         return found
 
     @property
-    def measures(self) -> list[str]:
-        """Names of what the task measures."""
-        return list(dict.fromkeys(name for row in self.rows for name in row.cell.measures))
+    def metrics(self) -> list[str]:
+        """Names of the metrics of the task."""
+        return list(dict.fromkeys(name for row in self.rows for name in row.cell.metrics))
 
     @property
     def has_reported(self) -> bool:

@@ -20,7 +20,7 @@ from torchrl_mcp.runs.build import Agent, make_agent, make_source, make_env, mak
 from torchrl_mcp.runs.builtin import builtin, publish
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.evaluation.rollout import evaluate, summary
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs.provenance import origin
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
@@ -161,7 +161,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
-    """Return the :func:`~torchrl_mcp.evaluation.rollout.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+    """Return the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics` of a run's policy, ``deterministic`` and ``stochastic``.
 
     Each has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
@@ -180,7 +180,7 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
         torch.manual_seed(seed)
         record = diagnosed(agent.actor)
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
-        results[mode] = summary(outcome, env.normalised_return)
+        results[mode] = episode_statistics(outcome, env.normalised_return)
         results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
     return results
 
