@@ -24,7 +24,7 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import FOLDER
 from torchrl_mcp.training import checkpoint
-from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.training.run_folder import CONFIG, replacing
 from torchrl_mcp.viewer.film import save_film
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -95,7 +95,8 @@ def set_phase(run: Path, steps: int, settings: Mapping[str, float]) -> None:
     cfg.training.total_frames = steps
     cfg.imitation.update(settings)
     cfg.task.pretrain.update(settings)
-    OmegaConf.save(cfg, run / CONFIG)
+    with replacing(run / CONFIG) as partial:
+        OmegaConf.save(cfg, partial)
 
 
 def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None:

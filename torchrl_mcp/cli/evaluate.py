@@ -4,7 +4,6 @@ With ``--output RUN/evaluation.json`` it leaves in a run folder what training en
 """
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from pathlib import Path
 from torchrl_mcp.evaluation.diagnostics import COLLAPSED
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+from torchrl_mcp.training.run_folder import write_json
 
 
 def main() -> None:
@@ -57,7 +57,7 @@ def main() -> None:
         )
     if arguments.output:
         numbers = results | ({"clips": [asdict(clip) for clip in clips]} if clips else {})
-        arguments.output.write_text(json.dumps(numbers, indent=2) + "\n")
+        write_json(numbers, arguments.output)
 
 
 if __name__ == "__main__":

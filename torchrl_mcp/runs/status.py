@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, write_json
 
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
@@ -93,9 +93,8 @@ def look(folder: Path, runs: Runs | None = None) -> list[Status]:
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
     """Write down which runs a benchmark has and how many steps each takes, for those who look on."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
-    path.write_text(json.dumps(steps, indent=2) + "\n")
+    write_json(steps, path)
 
 
 def read_manifest(path: Path) -> dict[Path, int]:
