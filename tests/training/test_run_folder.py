@@ -20,9 +20,14 @@ def test_readers_find_the_old_content_until_the_new_is_whole(tmp_path):
 def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     file = tmp_path / "numbers.csv"
     file.write_text("old")
-    with pytest.raises(KeyboardInterrupt), replacing(file) as partial:
-        partial.write_text("ne")
-        raise KeyboardInterrupt
+
+    def interrupted():
+        with replacing(file) as partial:
+            partial.write_text("ne")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert file.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["numbers.csv"]
 

@@ -24,6 +24,7 @@ from tqdm import tqdm
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.processes import start, ticks
+from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.checkpoint import FOLDER
 from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
 
@@ -253,16 +254,15 @@ def trajectory_file(folder: Path, name: str) -> Path:
 
 def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]]) -> str:
     """Return Markdown whose columns line up in a terminal."""
-    rows: list[tuple[str, ...]] = [("policy", "steps", "steps before", "deterministic", "stochastic")]
+    rows = []
     for name, line in lines.items():
-        cells = [
-            f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
-            for numbers in (results[name]["deterministic"], results[name]["stochastic"])
-        ]
-        rows.append((line.label, f"{line.steps:,}", f"{line.pretraining_steps:,}", *cells))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, tuple("-" * width for width in widths))
-    return "\n".join("| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows)
+        scores = {
+            mode: f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
+            for mode, numbers in results[name].items()
+        }
+        steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
+        rows.append({"policy": line.label, **steps, **scores})
+    return text_table(rows, markdown=True)
 
 
 def _settings(cfg: DictConfig | ListConfig) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 from torchrl_mcp.report.paper import METHODS, PLACES, SETTINGS, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
-from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")

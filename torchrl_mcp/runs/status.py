@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, write_json
 
 MANIFEST = "benchmark-{}.json"
@@ -124,7 +125,7 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
     rows = sorted(statuses, key=lambda one: order.index(one.state))
     shown = rows if height is None or len(rows) <= height else rows[: max(height, 1)]
     hidden = f"; {len(rows) - len(shown)} not shown" if len(shown) < len(rows) else ""
-    result = Table(caption=_count(statuses) + hidden, caption_justify="left", box=None, padding=(0, 2, 0, 0))
+    result = plain_table(_count(statuses) + hidden)
     result.add_column("run", overflow="fold")
     result.add_column("state")
     for name in ("steps", "steps/s", "return", "left"):
