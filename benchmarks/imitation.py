@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from omegaconf import OmegaConf
-from report import write
+from report import about, write
 
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure

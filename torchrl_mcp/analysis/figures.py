@@ -8,8 +8,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-# Okabe and Ito, "Color Universal Design", 2008, https://jfly.uni-koeln.de/color/, darkest contrasts first.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+# Okabe and Ito, "Color Universal Design", 2008, https://jfly.uni-koeln.de/color/, darkest contrasts first. The
+# eighth colour is grey, one for each of eight primitives: their yellow is too light for lines on white.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
 
 # A cycle for angles. Orange opposes blue and dark opposes light, which every kind of colour vision keeps apart. Unlike
 # in matplotlib's own cycles nothing is too light for lines on white. The held-out quarter has the strongest contrast.

@@ -12,9 +12,6 @@ from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
 from torchrl_mcp.analysis.specialisation import PHASE_BINS, stance_correlation
 from torchrl_mcp.analysis.walks import STATES, Walk, cycle_rows, plane, specialisation
 
-GREY = "#999999"
-"""The eighth colour, after those of all figures."""
-
 SHADE = "#EEEEEE"
 """Where the right foot stands alone."""
 
@@ -126,4 +123,4 @@ def _draw_actions(figure: SubFigure, walk: Walk) -> None:
 
 
 def _colours(num: int) -> list[str]:
-    return list(islice(cycle((*COLOURS, GREY)), num))
+    return list(islice(cycle(COLOURS), num))

@@ -16,7 +16,7 @@ LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS
 PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
 
 METHOD_COLOURS = dict(
-    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=True)
+    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=False)
 )
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
