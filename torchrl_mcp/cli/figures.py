@@ -82,7 +82,7 @@ def explore(arguments: argparse.Namespace) -> None:
     title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
     _save(exploration.draw_exploration(panels, title=title), stem)
     _write([{"panel": name, **row} for name, panel in panels.items() for row in exploration.path_rows(panel)], stem)
-    numbers = [{"panel": name, **exploration.summary(panel)} for name, panel in panels.items()]
+    numbers = [{"panel": name, **exploration.path_statistics(panel)} for name, panel in panels.items()]
     _write(numbers, stem, "summary")
     print(text_table(numbers))
 

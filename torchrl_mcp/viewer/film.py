@@ -24,7 +24,7 @@ AZIMUTH, ELEVATION = 115.0, -26.0
 """Degrees. Who walks along x is seen from the right and a little from the front, and no horizon is in sight."""
 
 DISTANCE = 2.8
-"""Of the camera, in reaches of the character."""
+"""Of the camera, in extents of the character."""
 
 LAG = 0.25
 """Seconds by which the camera is behind what it follows."""
@@ -49,7 +49,7 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
     timestep, model = player.env.control_timestep, softly_lit(player.env.simulation.model)
-    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.reach
+    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.extent
     camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
     camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
@@ -102,7 +102,7 @@ def save_film(
         height: Pixels.
         deterministic: Play the deterministic action rather than a sample.
         num_options: Number of options among which the policy chooses, 0 if it does not.
-        aside: How far beside the character to draw a ghost, in units of the character's reach.
+        aside: How far beside the character to draw a ghost, in units of the character's extent.
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
