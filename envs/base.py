@@ -22,7 +22,7 @@ class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
     A task says what is observed, rewarded and ended and how an episode begins, in the methods at the end of this class.
-    The class owns stepping, specs, partial resets, seeding, the time limit, snapshots and faults. What a task remembers
+    The class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. What a task remembers
     beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
 
     A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward
@@ -116,18 +116,18 @@ class CharacterEnv(EnvBase):
         return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """All that training needs to continue: the snapshot, the generator and the count of faults (``state_dict``)."""
+        """State of a training: the snapshot, the generator and the count of divergences (``state_dict``)."""
         return {
             "snapshot": dict(self.get_state()),
             "generator": self.generator.get_state(),
-            "faults": self.num_diverged,
+            "diverged": self.num_diverged,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
         self._snapshot = TensorDict(state["snapshot"], self.batch_size)
         self.generator.set_state(state["generator"].cpu())
-        self.num_diverged = state["faults"]
+        self.num_diverged = state["diverged"]
 
     def render(self, index: int = 0, *, width: int = 480, height: int = 480, distance: float = 4.0) -> Tensor:
         """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
@@ -176,12 +176,12 @@ class CharacterEnv(EnvBase):
                 f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on the CPU, "
                 "where the physics runs"
             )
-        faults = self.simulation.step(self._controls(action))
+        diverged = self.simulation.step(self._controls(action))
         self.episode["elapsed_steps"] += 1
-        reward, terminated = self._reward_and_termination(faults)
-        if len(faults):
-            reward[faults], terminated[faults] = 0.0, True
-            self.num_diverged += len(faults)
+        reward, terminated = self._reward_and_termination(diverged)
+        if len(diverged):
+            reward[diverged], terminated[diverged] = 0.0, True
+            self.num_diverged += len(diverged)
         truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._truncation()
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
@@ -261,11 +261,11 @@ class CharacterEnv(EnvBase):
         """
 
     @abstractmethod
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
 
         Args:
-            faults: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
+            diverged: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
         """
 
     @property

@@ -168,7 +168,7 @@ class Imitation(PDCharacterEnv):
 
     def get_extra_state(self) -> dict[str, Any]:
         """See :meth:`CharacterEnv.get_extra_state`; and what motions there are, and where references are lost."""
-        own = {"motions": self.library.digest, "difficulty": self._sampler.state_dict()}
+        own = {"motions": self.library.digest, "sampler": self._sampler.state_dict()}
         return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -183,7 +183,7 @@ class Imitation(PDCharacterEnv):
                 "begin another from it with stage=pretrain pretrained=<folder>"
             )
         super().set_extra_state(state)
-        self._sampler.load_state_dict(state["difficulty"])
+        self._sampler.load_state_dict(state["sampler"])
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
@@ -227,7 +227,7 @@ class Imitation(PDCharacterEnv):
         self._next = first if isinstance(ids, slice) else self._next.replaced(ids, first)
         return targets
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         self.episode["time"] += CONTROL_TIMESTEP
         reference = self._next
         error = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1).mean(-1)

@@ -59,7 +59,7 @@ def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def reach(model: mujoco.MjModel) -> float:
+def extent(model: mujoco.MjModel) -> float:
     """Return how far the first body below the world, in its rest pose, extends from its centre of mass, in metres."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -108,9 +108,9 @@ class Transport(PDCharacterEnv):
         """Whether the object is at the target, shape ``(N,)``, bool."""
         return torch.linalg.vector_norm((self._object - self._target)[:, :2], dim=-1) < SUCCESS_DISTANCE
 
-    def _reach(self, low: float, high: float) -> float:
+    def _extent(self, low: float, high: float) -> float:
         """Furthest that the character's rest pose extends from its root between two heights, all in metres."""
-        return reach(self.simulation.model, len(self._bodies), low, high)
+        return horizontal_extent(self.simulation.model, len(self._bodies), low, high)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         start = super()._sample(num)
@@ -146,7 +146,7 @@ class Transport(PDCharacterEnv):
         things = (part[ids].to(self._dtype) for part in self._things)
         return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(ids), things, strict=True)))
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
         self.episode["object"].copy_(self._object)
         reward = self._reward(
@@ -202,7 +202,7 @@ def mocap_positions(model: mujoco.MjModel) -> Tensor:
     return torch.from_numpy(model.body_pos[model.body_mocapid >= 0])
 
 
-def reach(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
+def horizontal_extent(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
     """How far a character's rest pose extends horizontally from its root.
 
     Args:

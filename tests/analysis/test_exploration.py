@@ -18,7 +18,7 @@ from torchrl_mcp.analysis.exploration import (
     fixed_latent,
     fixed_weights,
     path_rows,
-    summary,
+    path_statistics,
 )
 from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Heading
@@ -88,15 +88,15 @@ def test_who_is_thrown_goes_as_far_as_speed_times_time():
 
 def test_a_summary_counts_falls_distances_and_directions():
     result = paths((4.0, 0.0), (0.0, 2.0), (-1.0, 0.0), (0.0, -2.0), fallen=[2])
-    numbers = summary(result)
+    numbers = path_statistics(result)
     assert numbers["trajectories"] == 4
     assert numbers["upright"] == 0.75
     np.testing.assert_allclose(result.seconds, [1.0, 1.0, 0.5, 1.0])
     assert numbers["seconds"] == 1.0
     assert numbers["distance"] == pytest.approx(0.9 * 2.0)  # of 3.6, 1.8, 0.4 and 1.8
     assert numbers["spread"] == pytest.approx(1.0)
-    assert summary(paths((4.0, 0.0), (1.0, 0.0)))["spread"] == pytest.approx(0.0)
-    assert summary(paths((1.0, 0.0), (0.0, 1.0)))["spread"] == pytest.approx(1 - math.sqrt(0.5))
+    assert path_statistics(paths((4.0, 0.0), (1.0, 0.0)))["spread"] == pytest.approx(0.0)
+    assert path_statistics(paths((1.0, 0.0), (0.0, 1.0)))["spread"] == pytest.approx(1 - math.sqrt(0.5))
 
 
 def test_a_path_has_a_row_every_fifth_of_a_second_until_its_end():

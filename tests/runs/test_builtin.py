@@ -101,4 +101,4 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
 def test_what_comes_with_the_library_follows_its_motions(path):
     results = experiment.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25
-    assert results["deterministic"]["measures"]["tracking_error"] < 0.15
+    assert results["deterministic"]["metrics"]["tracking_error"] < 0.15

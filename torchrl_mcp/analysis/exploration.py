@@ -141,7 +141,7 @@ def explore(
     return Exploration(positions.numpy(), outcome.terminated.numpy(), env.control_timestep)
 
 
-def summary(exploration: Exploration) -> dict[str, float]:
+def path_statistics(exploration: Exploration) -> dict[str, float]:
     """Say how far exploration leads.
 
     ``upright`` is the share of characters that did not fall, ``seconds`` the median time until they did or the time was
@@ -205,7 +205,7 @@ def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure
 
 
 def _outcome(panel: Exploration) -> str:
-    numbers = summary(panel)
+    numbers = path_statistics(panel)
     return f"{numbers['upright']:.0%} upright, median {numbers['seconds']:.1f} s, reach {numbers['distance']:.1f} m"
 
 

@@ -9,8 +9,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -25,8 +24,9 @@ from tqdm import tqdm
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.processes import start, ticks
+from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.checkpoint import FOLDER
-from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
 
 Runs = Mapping[str, DictConfig]
 
@@ -172,8 +172,7 @@ def evaluate(folder: Path, runs: Runs, name: str) -> None:
         return
     path, directions = policies(folder, runs)[name].path, cfg.task.directions.transfer
     results = experiment.evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
-    with replacing(file) as part:
-        part.write_text(json.dumps(results))
+    write_json(results, file)
 
 
 def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
@@ -188,8 +187,8 @@ def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
     _, agent, env = experiment.restore(
         Path(cfg.run_dir), num_envs=len(directions), seed=cfg.demo.seed, max_episode_steps=cfg.demo.paths.steps
     )
-    with replacing(file) as part:
-        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), part)
+    with replacing(file) as partial:
+        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), partial)
 
 
 def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
@@ -230,8 +229,9 @@ def report(folder: Path, runs: Runs) -> str:
         name: {"label": line.label, "steps": line.steps, "pretraining_steps": line.pretraining_steps, **results[name]}
         for name, line in lines.items()
     }
-    (folder / "results.md").write_text(table + "\n")
-    (folder / "results.json").write_text(json.dumps(details, indent=2) + "\n")
+    with replacing(folder / "results.md") as partial:
+        partial.write_text(table + "\n")
+    write_json(details, folder / "results.json")
     groups = {"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]}
     curves = analysis.learning_curves(groups, num_bins=20)
     analysis.write_curves(curves, folder / "learning_curves.csv")
@@ -252,27 +252,17 @@ def trajectory_file(folder: Path, name: str) -> Path:
     return folder / "trajectories" / f"{name}.npz"
 
 
-@contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Give a path to write to that becomes ``file`` when the block ends well: a file that exists is whole."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
-    yield part
-    part.replace(file)
-
-
 def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]]) -> str:
     """Return Markdown whose columns line up in a terminal."""
-    rows: list[tuple[str, ...]] = [("policy", "steps", "steps before", "deterministic", "stochastic")]
+    rows = []
     for name, line in lines.items():
-        cells = [
-            f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
-            for numbers in (results[name]["deterministic"], results[name]["stochastic"])
-        ]
-        rows.append((line.label, f"{line.steps:,}", f"{line.pretraining_steps:,}", *cells))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, tuple("-" * width for width in widths))
-    return "\n".join("| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows)
+        scores = {
+            mode: f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
+            for mode, numbers in results[name].items()
+        }
+        steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
+        rows.append({"policy": line.label, **steps, **scores})
+    return text_table(rows, markdown=True)
 
 
 def _settings(cfg: DictConfig | ListConfig) -> dict[str, Any]:

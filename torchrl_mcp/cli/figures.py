@@ -22,6 +22,7 @@ from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, 
 from torchrl_mcp.report.paper import CHARACTERS, METHODS
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import PREFIX, locate
+from torchrl_mcp.runs.tables import text_table
 
 PROGRAM = "torchrl-mcp-figures"
 
@@ -81,9 +82,9 @@ def explore(arguments: argparse.Namespace) -> None:
     title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
     _save(exploration.draw_exploration(panels, title=title), stem)
     _write([{"panel": name, **row} for name, panel in panels.items() for row in exploration.path_rows(panel)], stem)
-    numbers = [{"panel": name, **exploration.summary(panel)} for name, panel in panels.items()]
+    numbers = [{"panel": name, **exploration.path_statistics(panel)} for name, panel in panels.items()]
     _write(numbers, stem, "summary")
-    print(_table(numbers))
+    print(text_table(numbers))
 
 
 def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], str]:
@@ -128,7 +129,7 @@ def analyse(arguments: argparse.Namespace) -> None:
             for networks, numbers in (("trained", specialisation(walk)), ("untrained", untrained))
         ]
     _write(rows, arguments.output / "primitives")
-    print(f"{_table(rows)}\n{PAPER}")
+    print(f"{text_table(rows)}\n{PAPER}")
 
 
 def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
@@ -179,16 +180,6 @@ def _write(rows: Sequence[Mapping[str, object]], stem: Path, part: str = "") -> 
         for row in rows:
             writer.writerow({key: f"{x:.5g}" if isinstance(x, float) else x for key, x in row.items()})
     print(path)
-
-
-def _table(rows: Sequence[Mapping[str, object]]) -> str:
-    lines = [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
-
-
-def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 def _parser() -> argparse.ArgumentParser:

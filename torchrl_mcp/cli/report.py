@@ -25,6 +25,7 @@ from torchrl_mcp.report.sections import (
     row,
     task_sections,
 )
+from torchrl_mcp.training.run_folder import replacing
 
 PAGES = ("report.html", "report.md")
 
@@ -42,9 +43,9 @@ def main() -> None:
         runs, damaged = find_runs(arguments.runs)
     except ValueError as error:
         sys.exit(f"torchrl-mcp-report: {error}")
-    arguments.output.mkdir(parents=True, exist_ok=True)
     for name, text in report(runs, damaged, moment=datetime.now(UTC)).items():
-        (arguments.output / name).write_text(text, encoding="utf-8")
+        with replacing(arguments.output / name) as partial:
+            partial.write_text(text, encoding="utf-8")
     counts = ", ".join(f"{number} {state}" for state, number in _states(runs, damaged).items() if number)
     print(f"{len(runs) + len(damaged)} runs, {counts}: {' '.join(str(arguments.output / name) for name in PAGES)}")
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 from torchrl_mcp.report.paper import METHODS, PLACES, SETTINGS, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
-from torchrl_mcp.report.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -105,9 +105,9 @@ class Cell:
         return self.runs[0].state
 
     @property
-    def measures(self) -> dict[str, float]:
-        """Means over seeds of what else the task measures of deterministic episodes, terms of the reward aside."""
-        return shared_means([run.evaluation["deterministic"].get("measures", {}) for run in self.complete], "reward_")
+    def metrics(self) -> dict[str, float]:
+        """Means over seeds of the metrics of deterministic episodes, without the terms of the reward."""
+        return shared_means([run.evaluation["deterministic"].get("metrics", {}) for run in self.complete], "reward_")
 
     @property
     def remarks(self) -> list[str]:

@@ -16,7 +16,7 @@ LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS
 PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
 
 METHOD_COLOURS = dict(
-    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=True)
+    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=False)
 )
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
@@ -117,9 +117,9 @@ class Section:
         return found
 
     @property
-    def measures(self) -> list[str]:
-        """Names of what the task measures."""
-        return list(dict.fromkeys(name for row in self.rows for name in row.cell.measures))
+    def metrics(self) -> list[str]:
+        """Names of the metrics of the task."""
+        return list(dict.fromkeys(name for row in self.rows for name in row.cell.metrics))
 
     @property
     def has_reported(self) -> bool:

@@ -1,6 +1,5 @@
 """The life of a run: trained in a folder of its own, resumed, restored, evaluated and published."""
 
-import json
 import math
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,10 +19,10 @@ from torchrl_mcp.runs.build import Agent, make_agent, make_source, make_env, mak
 from torchrl_mcp.runs.builtin import builtin, publish
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.evaluation.rollout import evaluate, summary
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs.provenance import origin
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN, replacing, write_json
 from torchrl_mcp.training.trainer import Trainer
 
 USUAL = ("collector", "evaluation")
@@ -42,9 +41,10 @@ def train(cfg: DictConfig) -> Path:
     trainer = _trainer(cfg, folder, _pretrained(cfg))
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
-    _write(origin(cfg.device), folder / ORIGIN)
+    write_json(origin(cfg.device), folder / ORIGIN)
     # Last, because it is what says that there is a run to resume.
-    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    with replacing(folder / CONFIG) as partial:
+        OmegaConf.save(cfg, partial, resolve=True)
     _finish(trainer, cfg, folder)
     return folder
 
@@ -161,7 +161,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
-    """Return the :func:`~torchrl_mcp.evaluation.rollout.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+    """Return the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics` of a run's policy, ``deterministic`` and ``stochastic``.
 
     Each has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
@@ -180,7 +180,7 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
         torch.manual_seed(seed)
         record = diagnosed(agent.actor)
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
-        results[mode] = summary(outcome, env.normalised_return)
+        results[mode] = episode_statistics(outcome, env.normalised_return)
         results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
     return results
 
@@ -218,7 +218,7 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     trainer.run()
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
-        _write(numbers, folder / EVALUATION)
+        write_json(numbers, folder / EVALUATION)
 
 
 def _usual(task: str) -> dict[str, DictConfig]:
@@ -227,13 +227,6 @@ def _usual(task: str) -> dict[str, DictConfig]:
     with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         cfg = compose("train", [f"task={task}"])
         return {key: cfg[key] for key in USUAL}
-
-
-def _write(content: dict[str, Any], path: Path) -> None:
-    """Write a JSON file that is whole if it is there."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(content, indent=2) + "\n")
-    part.replace(path)
 
 
 def _loggers(cfg: DictConfig) -> list[Logger]:

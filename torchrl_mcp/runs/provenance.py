@@ -1,19 +1,16 @@
 """Where a run comes from: command, code, choices and machine."""
 
-import os
-import platform
 import shutil
 import subprocess
 import sys
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 
 from torchrl_mcp import __version__
+from torchrl_mcp.runs.machine import machine
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -50,28 +47,6 @@ def commit(folder: Path) -> str | None:
     if not _git(folder, "ls-files", "."):
         return None
     return _git(folder, "describe", "--always", "--dirty", "--exclude=*")
-
-
-def machine(device: str) -> dict[str, Any]:
-    """Return processor, cores, device and the versions of all that makes numbers."""
-    libraries = {name: version(name) for name in ("torch", "torchrl", "mujoco")}
-    on_gpu = torch.device(device).type == "cuda"
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "device": torch.cuda.get_device_name(device) if on_gpu else device,
-        "python": platform.python_version(),
-        **libraries,
-    }
-
-
-def _processor() -> str:
-    description = Path("/proc/cpuinfo")
-    if description.exists():
-        for line in description.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

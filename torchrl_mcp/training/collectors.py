@@ -120,7 +120,7 @@ class LocalSource:
 
     def metrics(self) -> dict[str, float]:
         """Return the number of simulations that became unstable so far."""
-        return {"episode/faults": self.env.num_diverged}
+        return {"episode/diverged": self.env.num_diverged}
 
     def stop(self) -> None:
         """Shut the collector down, and the environments with it."""

@@ -98,7 +98,7 @@ def play_in_browser(player: Player, *, port: int) -> None:
         player: What to show.
         port: Of the page, 0 for the first free one from 8080.
     """
-    stage, pace = Stage(distance=FURTHER * DISTANCE * player.reach), Pace()
+    stage, pace = Stage(distance=FURTHER * DISTANCE * player.extent), Pace()
     model = softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
