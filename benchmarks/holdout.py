@@ -178,7 +178,7 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
         "commit": run.commit,
         "torch": torch.__version__,
         "machine": platform.machine(),
-        "command": shlex.join(run.origin.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
+        "command": shlex.join(run.provenance.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
     }
     return [facts | {"mode": mode, "paper": contender.paper} | values | source for mode, values in numbers.items()]
 

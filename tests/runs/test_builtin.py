@@ -52,7 +52,7 @@ def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16
 
 def test_a_published_policy_is_a_small_part_of_the_checkpoint_and_names_no_folder(run, published):
     assert published.stat().st_size < checkpoint.find(run).stat().st_size / 8
-    assert str(run.parent) not in str(checkpoint.configuration(published))
+    assert str(run.parent) not in str(checkpoint.saved_config(published))
 
 
 def test_primitives_are_transferred_from_what_comes_with_the_library(run, published, tmp_path, monkeypatch):

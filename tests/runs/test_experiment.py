@@ -22,7 +22,7 @@ CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
 
 def command(name, *arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", f"torchrl_mcp.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
+        [sys.executable, "-m", f"torchrl_mcp.cli.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
     )
 
 

@@ -168,7 +168,7 @@ class RemoteSource:
         num_envs: int,
         seed: int,
         num_workers: int,
-        num_threads: int = 1,
+        num_threads: int,
         backend: str = "process",
         backend_options: Mapping[str, Any] | None = None,
     ) -> None:

@@ -9,7 +9,7 @@ METRICS = "metrics.csv"
 EVALUATION = "evaluation.json"
 """How the policy did that training ended with."""
 
-ORIGIN = "origin.json"
+PROVENANCE = "origin.json"
 """Where the run comes from: command, commit, versions and machine."""
 
 LOG = "train.log"
