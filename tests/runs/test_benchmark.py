@@ -174,6 +174,8 @@ def test_what_concerns_the_task_of_transfer_is_kept_from_pretraining():
     expected = {"method": "mcp", "task": "imitation", "stage": "pretrain"}
     assert benchmark.pretraining_of(settings, task) == expected
     ant = {"name": "holdout", "pretrain": {}, "transfer": {}}
+    added = {"method": "mcp", "task": "carry", "+task.transfer.success_reward": "true"}
+    assert benchmark.pretraining_of(added, task) == expected
     settings = {"task": "holdout", "task.pretrain.max_episode_steps": "50"}
     assert benchmark.pretraining_of(settings, ant) == {**settings, "stage": "pretrain"}
 

@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_module
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.trainer import Trainer
 
 TIMES = ("seconds", "time/")

@@ -91,7 +91,7 @@ def _resume(folder: Path) -> Path:
 def _is_argument(key: str, cfg: DictConfig) -> bool:
     """Tell whether a setting is an argument of what its group makes."""
     group, _, name = key.rpartition(".")
-    made = OmegaConf.select(cfg, f"{group}._target_")
+    made = group and OmegaConf.select(cfg, f"{group}._target_")
     return bool(made) and name in build.arguments(made)
 
 
