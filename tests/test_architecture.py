@@ -25,6 +25,9 @@ RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folder
 HYDRA = {"torchrl_mcp.runs.build", "torchrl_mcp.runs.benchmark"}
 """Modules beside those of ``cli`` that may import Hydra: one makes what it configures, one drives its launchers."""
 WITHOUT_HYDRA = (
+    *("distributions", "modules", "methods", "objectives", "evaluation", "training"),
+    *("envs", "analysis", "viewer"),
+)
     "distributions",
     "modules",
     "methods",

@@ -90,11 +90,11 @@ def times(root):
 
 
 def test_table_2_has_exactly_the_cells_of_the_paper():
-    benchmark = OmegaConf.to_container(OmegaConf.load(BENCHMARKS / "table2.yaml"))
-    cells = [(c["task"], c["character"], c["method"]) for c in benchmark.expand(benchmark["rows"], {})]
+    table = OmegaConf.to_container(OmegaConf.load(BENCHMARKS / "table2.yaml"))
+    cells = [(c["task"], c["character"], c["method"]) for c in benchmark.expand(table["rows"], {})]
     paper = [(*row, m) for row, marks in TABLE_2.items() for m, mark in zip(METHODS, marks, strict=True) if mark == "1"]
     assert sorted(cells) == sorted(paper)
-    assert benchmark["params"] == {"seed": "0,1,2"}
+    assert table["params"] == {"seed": "0,1,2"}
 
 
 def test_the_tasks_of_a_character_share_the_pretraining_of_their_method_and_seed(tmp_path):
