@@ -4,10 +4,8 @@ from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build
-from torchrl_mcp.runs import builtin
+from torchrl_mcp.runs import build, builtin, experiment
 from torchrl_mcp.training import checkpoint
-from torchrl_mcp.runs import experiment
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]

@@ -50,4 +50,6 @@ def test_a_setting_is_among_others_with_all_that_is_below_it_and_nothing_that_be
 
 
 def test_pretraining_ignores_nothing_that_it_learns_from():
-    assert not any(is_among(name, TRANSFER_ONLY) for name in ("training.total_frames", "num_primitives", "budget.pretrain"))
+    assert not any(
+        is_among(name, TRANSFER_ONLY) for name in ("training.total_frames", "num_primitives", "budget.pretrain")
+    )

@@ -57,7 +57,9 @@ def require_environment(cfg: DictConfig) -> None:
     environment, *_ = [get_object(name) for name in named]
     able = getattr(environment, "characters", tuple)()
     if able and character not in able:
-        raise ValueError(f"no environment has task={task} with character={character}: pass character={' or '.join(able)}")
+        raise ValueError(
+            f"no environment has task={task} with character={character}: pass character={' or '.join(able)}"
+        )
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
