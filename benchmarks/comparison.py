@@ -66,7 +66,7 @@ def main() -> None:
 def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
     """Return the facts of a run and its numbers in a mode."""
     numbers, before = run.evaluation[mode], run.settings.get("pretrained")
-    machine, command = run.origin.get("machine", {}), run.origin.get("command", [])
+    machine, command = run.provenance.get("machine", {}), run.provenance.get("command", [])
     return {
         "method": name,
         "seed": run.seed,

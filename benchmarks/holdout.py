@@ -173,8 +173,8 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
     source = {
         "seconds": round(run.seconds),
         "commit": run.commit,
-        **run.origin.get("machine", {}),
-        "command": shlex.join(run.origin.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
+        **run.provenance.get("machine", {}),
+        "command": shlex.join(run.provenance.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
     }
     return [facts | {"mode": mode, "paper": contender.paper} | values | source for mode, values in numbers.items()]
 

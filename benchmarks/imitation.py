@@ -81,7 +81,7 @@ def train(run: Path, character: str) -> None:
             set_phase(run, steps, settings)
             arguments = [f"resume={run}"]
         else:
-            phase = [f"imitation.{name}={value}" for name, value in settings.items()]
+            phase = [f"+imitation.{name}={value}" for name, value in settings.items()]
             facts = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
             arguments = [*COMMON, *MACHINE, *facts, *phase]
         command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]

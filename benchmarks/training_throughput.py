@@ -45,7 +45,7 @@ Iteration = dict[str, Any]
 """What a worker reports: ``seconds``, peak ``memory`` in MiB, and ``shares`` of the seconds by section."""
 
 
-def configuration(*overrides: str) -> DictConfig:
+def composed(*overrides: str) -> DictConfig:
     """Return the configuration of a training run."""
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return compose("train", list(overrides))
@@ -80,7 +80,6 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         "task": "holdout",
         "task.directions.pretrain": [0, 0],  # +x, where the reward is that of Ant-v5
         "task.pretrain.max_episode_steps": 1000,
-        "task.pretrain.contact_forces": False,
         "autocast": precision == "bf16",
         "optimizer.actor.lr": STEP_SIZE,
         "optimizer.critic.lr": STEP_SIZE,
@@ -91,7 +90,7 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         "run_dir": ".",
         **{f"training.{key}": value for key, value in training.items()},
     }
-    cfg = configuration(*(f"{key}={value}" for key, value in settings.items()))
+    cfg = composed(*(f"{key}={value}" for key, value in settings.items()))
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, Path(cfg.run_dir))
     turns = Turns()
@@ -133,7 +132,7 @@ def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
         env_kwargs={"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0},
         vec_env_cls=classes[vec_env],
     )
-    cells, std = [1024, 512], configuration("method=scratch").parts.policy.std
+    cells, std = [1024, 512], composed("method=scratch").parts.policy.std
     ppo = PPO(
         "MlpPolicy",
         env,
@@ -248,7 +247,7 @@ def main() -> None:
         worker(args.worker[1], json.loads(args.worker[0]), args.threads)
         return
 
-    preset = configuration("preset=fast").training
+    preset = composed("preset=fast").training
     training = QUICK_TRAINING if args.quick else {key: preset[key] for key in QUICK_TRAINING}
     contenders = available(args.contenders or (QUICK_CONTENDERS if args.quick else CONTENDERS))
     if not contenders:

@@ -101,6 +101,11 @@ class CharacterEnv(EnvBase):
         self._dtype, self._pin_memory = dtype, pin_memory
         self._cameras: dict[tuple[int, int], Camera] = {}
 
+    @classmethod
+    def characters(cls) -> tuple[str, ...]:
+        """Return the names of the characters that can do the task, or nothing where it does not say."""
+        return ()
+
     @property
     def physics_seconds(self) -> float:
         """Wall-clock seconds spent inside MuJoCo so far."""

@@ -123,6 +123,11 @@ class Holdout(CharacterEnv):
         self._torso = self.simulation.outputs["xpos"][:, TORSO, :2]
         self._make_specs()
 
+    @classmethod
+    def characters(cls) -> tuple[str, ...]:
+        """See :meth:`CharacterEnv.characters`: Gymnasium's ant alone."""
+        return ("ant",)
+
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 earns nothing and 1 is what Gymnasium calls solved, unclipped.
 

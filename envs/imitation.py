@@ -64,8 +64,9 @@ class Imitation(PDCharacterEnv):
         clips: Reference motions of that character: a library, or clips by name.
         num_envs: Number N of simulations.
         terms: Weight and scale of each error in the reward, by name.
-        max_error: Largest mean distance of bodies from the reference, in metres.
-        switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        max_error: Largest mean distance of bodies from the reference, in metres; 0.5 is clearly worse than 0.3.
+        switch_interval: Mean time between changes of the reference, in seconds; infinite for none. The paper does not
+            say.
         switch_candidates: Number of random moments of which the most similar becomes the reference: 1 asks for motions
             that no body can go over to, as from a fast walk to standing, and with more of them changes become easier.
         switch_to: ``"any"`` clip, or the ``"same"``, which brings a reference back to a character that has drifted off
@@ -95,7 +96,7 @@ class Imitation(PDCharacterEnv):
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
-        switch_candidates: int = 1,
+        switch_candidates: int = 16,
         switch_to: str = "any",
         clip_end: str = "truncate",
         failure_weighting: float = 0.0,

@@ -94,6 +94,11 @@ class PDCharacterEnv(CharacterEnv):
         self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
         self._twists, self._com = outputs["cvel"][:, bodies], outputs["subtree_com"][:, 1]
 
+    @classmethod
+    def characters(cls) -> tuple[str, ...]:
+        """See :meth:`CharacterEnv.characters`: all that are known."""
+        return tuple(CHARACTERS)
+
     def heading(self, ids: Tensor | slice = ALL) -> Tensor:
         """Direction that characters face, in radians from the world's x axis, shape ``(n,)``, float64."""
         return heading(self._orientations[ids, 0])

@@ -86,7 +86,6 @@ def test_what_a_choice_brings_along_goes_without_saying(write_run):
         {"device": "cuda"},
         {"pretrained": "runs/other"},
         {"logger__name": "csv"},
-        {"task__fast__num_envs": 3},
         {"task__pretrain__speed": 2.0},
         {"evaluation__episodes": 3},
         {"added_later": 1},
@@ -98,6 +97,13 @@ def test_what_changes_no_learning_parts_no_seeds(write_run, setting):
     before = {} if name == "added_later" else {name: None}
     (cell,) = grouped(write_run("a", **before), write_run("b", seed=1, **setting))
     assert len(cell.runs) == 2
+
+
+def test_an_argument_that_only_some_runs_name_tells_them_apart(write_run):
+    made = {"task__transfer___target_": "torchrl_mcp.envs.Heading"}
+    usual, other = grouped(write_run("a", **made), write_run("b", seed=1, **made, task__transfer__max_turn=0.3))
+    assert usual.settings == {"task.transfer.max_turn": "default"}
+    assert other.settings == {"task.transfer.max_turn": 0.3}
 
 
 def test_only_complete_runs_count_and_the_others_are_remarked(write_run):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -43,15 +42,6 @@ SPACING = math.radians(7.5)
 """Between the target directions of trajectories."""
 
 
-def configuration(path: Path) -> DictConfig:
-    """Return the configuration of a run folder's newest checkpoint, or of a checkpoint file.
-
-    Raises:
-        ValueError: If there is no checkpoint or it is damaged.
-    """
-    return OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
-
-
 def walk_of(
     path: Path, *, clip: str | None, walkers: int, seconds: float, seed: int
 ) -> tuple[Walk, Mapping[str, float]]:
@@ -67,7 +57,7 @@ def walk_of(
     Raises:
         ValueError: If the run is of another task, has no weights of primitives, or cannot walk.
     """
-    cfg = configuration(path)
+    cfg = experiment.policy_config(path)
     if cfg.task.name != "imitation":
         raise ValueError(
             f"{path} is of task={cfg.task.name}: Figure 7 is of pre-training, give a run of task=imitation"
@@ -120,8 +110,8 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
         case "mcp" | "moe":
             # Paper: Gaussian weights. Here the logits are, as with exploration=weights: weights stay between 0 and 1.
             logits = torch.randn(num, cfg.num_primitives, generator=generator)
-            gates = instantiate(cfg.gating.activation)(logits)
-            return fixed_weights(parts["primitives"], instantiate(cfg.mixer.distribution_class), gates)
+            gates = build.instantiate(cfg.gating.activation)(logits)
+            return fixed_weights(parts["primitives"], build.instantiate(cfg.mixer.distribution_class), gates)
         case "latent_space":
             return fixed_latent(parts["decoder"], torch.randn(num, cfg.latent_dim, generator=generator))
         case "hierarchical":
@@ -177,7 +167,7 @@ def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
     Returns:
         Trajectories by a name that says when and where; of a run that is not over, that it is not.
     """
-    cfg, panels = configuration(path), {}
+    cfg, panels = experiment.policy_config(path), {}
     over = path.is_file() or checkpoint.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):

@@ -13,16 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import torch
-from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_mcp import __version__, analysis
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.identity import PLACES, differences
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.checkpoint import FOLDER
@@ -91,7 +91,7 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
         ValueError: If the settings contradict each other or those of the folder, or a process fails.
     """
     began = time.monotonic()
-    runs = {name: configuration(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
+    runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
     runs["transfer"].pretrained = runs["pretrain"].run_dir
     require_early_checkpoint(runs)
     print(f"Working in {folder}. Interrupt it when you like: called again, it goes on from there.", flush=True)
@@ -101,18 +101,18 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     print(CONTENTS.format(folder=folder))
 
 
-def configuration(folder: Path, overrides: Sequence[str]) -> DictConfig:
+def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
     Raises:
         ValueError: If the folder holds a run with another one.
     """
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", list(overrides))
+    cfg = build.compose_run(*overrides)
     cfg.run_dir = str(folder)
-    saved = folder / CONFIG
-    if saved.exists() and _settings(OmegaConf.load(saved)) != _settings(cfg):
-        raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
+    if (folder / CONFIG).exists():
+        held, wanted = (OmegaConf.to_container(one, resolve=True) for one in (experiment.run_config(folder), cfg))
+        if differences(cast("dict", held), cast("dict", wanted), PLACES):
+            raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
     return cfg
 
 
@@ -263,12 +263,6 @@ def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]
         steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
         rows.append({"policy": line.label, **steps, **scores})
     return text_table(rows, markdown=True)
-
-
-def _settings(cfg: DictConfig | ListConfig) -> dict[str, Any]:
-    """All that makes a run what it is, wherever it lies."""
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    return {key: value for key, value in settings.items() if key not in ("run_dir", "pretrained")}
 
 
 def _steps(cfg: DictConfig) -> int:

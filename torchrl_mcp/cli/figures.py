@@ -58,7 +58,7 @@ def holdout(arguments: argparse.Namespace) -> None:
     """Draw Figure 5: learning curves on the held-out directions, and trajectories by target direction."""
     runs: dict[str, dict[str, list[Path]]] = {}
     for path in arguments.checkpoints:
-        cfg = checkpoints.configuration(path)
+        cfg = experiment.policy_config(path)
         if cfg.task.name != "holdout":
             raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that")
         runs.setdefault(_label(cfg), {}).setdefault(cfg.stage.name, []).append(path)
@@ -112,7 +112,7 @@ def analyse(arguments: argparse.Namespace) -> None:
     """Draw Figure 7: weights over the walk cycle and mean actions of primitives, and say how far they specialise."""
     rows = []
     for name, path in _named(arguments.checkpoints):
-        cfg = checkpoints.configuration(path)
+        cfg = experiment.policy_config(path)
         walk, untrained = checkpoints.walk_of(
             path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
         )

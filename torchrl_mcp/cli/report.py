@@ -115,7 +115,7 @@ def _overview(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _machine(run: Run) -> str:
     """The machine and the libraries of a run in one line."""
-    machine = run.origin.get("machine") or {}
+    machine = run.provenance.get("machine") or {}
     parts = (
         f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
     )

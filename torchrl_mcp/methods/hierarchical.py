@@ -28,7 +28,7 @@ def primitive_parts(
         goal_dim: Size of the goal, ``G``, which only the critic sees.
         action_dim: Size of the action, ``A``.
         primitives: Makes the primitives from ``(S, A, K)``.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         normaliser: Makes an input normaliser from a size.
     """
     return nn.ModuleDict(
@@ -57,7 +57,7 @@ def gated_parts(
         action_dim: Size of the action, ``A``.
         gating: Makes the network for the logits of the choice from ``(S, G, K)``.
         primitives: Makes the primitives from ``(S, A, K)``.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         normaliser: Makes an input normaliser from a size.
     """
     parts = primitive_parts(
@@ -72,7 +72,7 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
 
     Args:
         parts: Made by :func:`primitive_parts`.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         frozen: Names of the parts that do not change in training.
     """
     policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), *_acting(parts))
@@ -86,7 +86,7 @@ def gated_actor(
 
     Args:
         parts: Made by :func:`gated_parts`.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         steps_per_choice: Control steps for which a primitive acts.
         frozen: Names of the parts that do not change in training.
 

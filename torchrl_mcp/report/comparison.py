@@ -10,16 +10,13 @@ from typing import Any, TypeVar
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 from torchrl_mcp.report.paper import METHODS, PLACES, SETTINGS, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
+from torchrl_mcp.runs.identity import UNLEARNT, is_among
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
 
-# What changes where, how fast or how visibly a run learns, not what it learns; the stages' environments are in task.*.
-BOOKKEEPING = (
-    *("seed", "device", "autocast", "num_threads", "torch_threads", "collector", "benchmark", "evaluation"),
-    *("pretrained", "resume", "run_root", "run_dir", "checkpoint_interval", "keep_checkpoints"),
-    *("progress_bar", "logger", "motions", "imitation", "task.fast", "task.evaluation"),
-)
+DEFAULT = "default"
+"""Value of an argument that no setting of a run names."""
 
 
 @dataclass(frozen=True)
@@ -157,8 +154,8 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     """Group runs into cells, in the paper's order of tasks, stages and methods.
 
     Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or, where these are
-    alike, any other value of their configuration, :data:`BOOKKEEPING` aside. Commits do not part them: a cell remarks
-    on them.
+    alike, any other value of their configuration that :mod:`~torchrl_mcp.runs.identity` counts. Commits do not part
+    them: a cell remarks on them.
     """
     found = []
     for alike in _grouped(runs, lambda run: (run.place, run.stage, run.method)).values():
@@ -223,7 +220,7 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
     for alike in _grouped(runs, lambda run: _frozen(_learned(run), others)).values():
         first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
         settings = {name: named[name] for name in telling if named[name] is not None}
-        settings |= {name: learned[name] for name in others}
+        settings |= {name: learned.get(name, DEFAULT) for name in others}
         by_seed = sorted(alike, key=lambda run: run.seed)
         found.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
     return found
@@ -232,22 +229,24 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
 def _learned(run: Run) -> dict[str, Any]:
     """What of a run's configuration may change what it learns."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
-    ignored = (*BOOKKEEPING, other_stage)
-    return {
-        name: value
-        for name, value in run.settings.items()
-        if not any(name == prefix or name.startswith(f"{prefix}.") for prefix in ignored)
-    }
+    ignored = UNLEARNT | {other_stage}
+    return {name: value for name, value in run.settings.items() if not is_among(name, ignored)}
 
 
 def _varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names that all have, with more than one value."""
-    names = [name for name in settings[0] if all(name in other for other in settings)]
-    return [name for name in names if len({repr(other[name]) for other in settings}) > 1]
+    """Names with more than one value. What some lack counts where it is an argument, which has a default then."""
+    names = dict.fromkeys(name for one in settings for name in one)
+    shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
+    return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
+
+
+def _target(name: str) -> str:
+    """Name of the setting that says of what a setting would be an argument."""
+    return f"{name.rpartition('.')[0]}._target_"
 
 
 def _frozen(settings: Mapping[str, Any], names: Iterable[str] | None = None) -> Hashable:
-    return tuple((name, repr(settings[name])) for name in (settings if names is None else names))
+    return tuple((name, repr(settings.get(name, DEFAULT))) for name in (settings if names is None else names))
 
 
 def _grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:

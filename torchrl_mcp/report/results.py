@@ -1,4 +1,4 @@
-"""What run folders say of themselves: configuration, progress, evaluation and origin."""
+"""What run folders say of themselves: configuration, progress, evaluation and provenance."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, ORIGIN
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
@@ -49,7 +49,7 @@ class Run:
         seconds: Wall time of them.
         has_episodes: Whether an episode has ended, so that there is a learning curve.
         evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
-        origin: Commit, choices and machine of its beginning; empty of older runs.
+        provenance: Commit, choices and machine of its beginning; empty of older runs.
         fault: What is wrong with its files, or None.
     """
 
@@ -59,7 +59,7 @@ class Run:
     seconds: float = 0.0
     has_episodes: bool = False
     evaluation: Mapping[str, Any] = field(default_factory=dict)
-    origin: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
     fault: str | None = None
 
     @property
@@ -90,12 +90,12 @@ class Run:
     @property
     def preset(self) -> str:
         """Preset of its settings, ``unknown`` of runs that did not note it."""
-        return self.origin.get("choices", {}).get("preset", "unknown")
+        return self.provenance.get("choices", {}).get("preset", "unknown")
 
     @property
     def commit(self) -> str:
         """Commit of the library that it began with, ``unknown`` of runs that did not note it."""
-        return self.origin.get("commit") or "unknown"
+        return self.provenance.get("commit") or "unknown"
 
     @property
     def progress(self) -> float:
@@ -144,7 +144,7 @@ def read_run(folder: Path) -> Run | Damaged:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
     contents: dict[str, Any] = {"settings": settings}
     faults = []
-    for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (ORIGIN, _origin)):
+    for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
         try:
             contents |= read(folder)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
@@ -191,12 +191,12 @@ def _evaluation(folder: Path) -> dict[str, Any]:
     return {"evaluation": content}
 
 
-def _origin(folder: Path) -> dict[str, Any]:
-    if not (folder / ORIGIN).exists():
+def _provenance(folder: Path) -> dict[str, Any]:
+    if not (folder / PROVENANCE).exists():
         return {}
-    content = json.loads((folder / ORIGIN).read_text())
+    content = json.loads((folder / PROVENANCE).read_text())
     content.get("choices", {}).get("preset")
-    return {"origin": content}
+    return {"provenance": content}
 
 
 def _line(error: Exception) -> str:

@@ -2,12 +2,10 @@
 
 import shutil
 import subprocess
-import sys
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-
-from hydra.core.hydra_config import HydraConfig
 
 from torchrl_mcp import __version__
 from torchrl_mcp.runs.machine import machine
@@ -15,25 +13,23 @@ from torchrl_mcp.runs.machine import machine
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def origin(device: str) -> dict[str, Any]:
-    """Return what a run on ``device`` should remember of its beginning, JSON-compatible.
+def provenance(device: str, command: Sequence[str], choices: Mapping[str, str]) -> dict[str, Any]:
+    """Return where a run comes from, JSON-compatible.
+
+    Args:
+        device: Where its networks are.
+        command: The words of the command that began it.
+        choices: The choice of each group of its configuration.
 
     Returns:
-        ``command`` as a list of words; ``commit`` of the library, with ``-dirty`` where files were changed since, or
-        None where it is no checkout; its ``version``; ``choices``, the choice of each group of the configuration,
-        where Hydra runs; ``started``, an ISO time; and the ``machine``.
+        ``command``; ``commit`` of the library, with ``-dirty`` where files were changed since, or None where it is no
+        checkout; its ``version``; ``choices``; ``started``, an ISO time; and the ``machine``.
     """
-    command, choices = list(sys.argv), {}
-    if HydraConfig.initialized():
-        hydra = HydraConfig.get()
-        command = ["torchrl-mcp-train", *hydra.overrides.task]
-        made = hydra.runtime.choices.items()
-        choices = {group: choice for group, choice in made if choice and not group.startswith("hydra/")}
     return {
-        "command": command,
+        "command": list(command),
         "commit": commit(PACKAGE),
         "version": __version__,
-        "choices": choices,
+        "choices": dict(choices),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(device),
     }

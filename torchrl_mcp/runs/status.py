@@ -1,6 +1,6 @@
 """How far are the runs of a folder?
 
-Everything is read from the run folders, so it works beside a sweep in any process on any machine that shares them.
+Everything is read from the run folders, so it works beside a benchmark in any process on any machine that shares them.
 """
 
 import csv

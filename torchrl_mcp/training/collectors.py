@@ -136,7 +136,7 @@ class LocalSource:
 
 
 def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) -> LocalSource:
-    """Return a collection in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
+    """Return a source in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
     return LocalSource(make_env(num_envs=num_envs, seed=seed))
 
 
@@ -168,7 +168,7 @@ class RemoteSource:
         num_envs: int,
         seed: int,
         num_workers: int,
-        num_threads: int = 1,
+        num_threads: int,
         backend: str = "process",
         backend_options: Mapping[str, Any] | None = None,
     ) -> None:

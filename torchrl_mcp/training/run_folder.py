@@ -16,7 +16,7 @@ METRICS = "metrics.csv"
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""
 
-ORIGIN = "origin.json"
+PROVENANCE = "origin.json"
 """The run's provenance: command, commit, versions and machine."""
 
 LOG = "train.log"

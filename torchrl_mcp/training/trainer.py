@@ -149,7 +149,7 @@ class Trainer:
         self.source.stop()
 
     def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``; where the collection's state is all in it, to the same numbers.
+        """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
 
         Raises:
             ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
