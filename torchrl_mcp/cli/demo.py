@@ -53,7 +53,7 @@ CONTENTS = """\
 
 @dataclass(frozen=True)
 class Policy:
-    """A line of the table.
+    """A policy in the table of results.
 
     Attributes:
         label: What the table calls it.

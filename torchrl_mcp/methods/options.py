@@ -79,7 +79,7 @@ class Terminations(nn.Module):
 
 
 class WhereBeginning(nn.Module):
-    """Evaluates scores only where an option begins: elsewhere nobody asks, and they are zero.
+    """Scores that are evaluated only where an option begins, and are zero elsewhere.
 
     Args:
         scores: From state ``(n, S)`` and goal ``(n, G)`` to ``(n, K)``.

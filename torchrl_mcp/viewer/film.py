@@ -1,4 +1,4 @@
-"""Films of policies at work."""
+"""Films of policies."""
 
 import math
 from collections.abc import Iterable, Iterator
