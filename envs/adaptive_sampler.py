@@ -1,4 +1,4 @@
-"""Where in its reference motions a character fails."""
+"""The adaptive sampler of reference motions, which prefers moments where episodes end."""
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ PRIOR_STEPS, PRIOR_FAILURES = 100.0, 1.0
 
 
 class AdaptiveSampler:
-    r"""Counts how often references are lost, second by second, and draws moments accordingly.
+    r"""A sampler of moments in reference motions, weighted by how often references are lost there.
 
     .. math:: P(j) \propto W_j \lambda_j
 

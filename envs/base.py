@@ -1,4 +1,4 @@
-"""What the environments of all characters and tasks share."""
+"""The base class of all environments."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""One simulation at a time, as Gymnasium wants it."""
+"""Gymnasium environments of a single simulation."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Motion imitation: the task from which primitives are pre-trained."""
+"""The imitation task: follow reference motions, which is how primitives are pre-trained."""
 
 from collections.abc import Mapping
 from typing import Any, cast

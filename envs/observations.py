@@ -1,4 +1,4 @@
-"""What a character observes of itself, as functions of tensors."""
+"""The observation of a character's own state, as functions of tensors."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Characters under PD control, and what their tasks share: the state, falls and the scene."""
+"""Characters under PD control: their state, falls and scene, which all their tasks share."""
 
 import math
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""Pictures of a simulation, without a display, and what is drawn beside it."""
+"""Pictures of a simulation without a display, shapes drawn into them, and GIFs."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise

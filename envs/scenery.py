@@ -1,4 +1,4 @@
-"""What a task means, drawn beside its simulation: arrows to targets, and the reference as a ghost."""
+"""Shapes that explain a task: arrows to targets, and the reference as a ghost."""
 
 import copy
 

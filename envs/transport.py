@@ -1,4 +1,4 @@
-"""What carrying and dribbling have in common: an object, a target, and the way between them."""
+"""The base class of carrying and dribbling: an object, a target, and the way between them."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

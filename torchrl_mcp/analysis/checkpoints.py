@@ -1,4 +1,4 @@
-"""What the paper's figures show, asked of checkpoints: how they walk, explore, and take directions."""
+"""Data of the paper's figures from checkpoints: walks, exploration, and trajectories by direction."""
 
 import dataclasses
 import math

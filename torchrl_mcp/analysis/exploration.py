@@ -1,4 +1,4 @@
-"""Where characters go that explore at random: Figure 6.
+"""Paths of random exploration: Figure 6.
 
 An *explorer* is a function from normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal.
 """
@@ -34,7 +34,7 @@ SPACING = 0.2
 
 @dataclass(frozen=True)
 class Exploration:
-    """Where characters went that began alike.
+    """Paths of characters that began in the same state.
 
     Attributes:
         positions: Horizontal position of the root in metres from where it began, ``(T + 1, N, 2)``; NaN after the end.
@@ -82,7 +82,7 @@ def fixed_latent(decoder: nn.Module, latent: Tensor) -> Explorer:
 
 
 class RandomSequence:
-    """Lets one primitive act after the other in random order, each for as many steps, and plays mean actions.
+    """A policy of primitives that act in random order, each for the same number of steps, by their mean actions.
 
     Args:
         primitives: From states and the options that act, ``(N,)``, to means and standard deviations, each ``(N, A)``.

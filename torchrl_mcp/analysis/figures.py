@@ -1,4 +1,4 @@
-"""What all figures share: a plain look, colours that colour-blind readers can tell apart, and the files."""
+"""The plain look of all figures, a palette for colour-blind readers, and the writing of files."""
 
 from itertools import cycle, islice
 from pathlib import Path

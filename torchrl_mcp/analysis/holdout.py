@@ -1,4 +1,4 @@
-"""Where a character goes that is told where to go: trajectories by target direction, as in Figure 5 (right)."""
+"""Trajectories by target direction, as in Figure 5 (right)."""
 
 import math
 from collections.abc import Mapping, Sequence

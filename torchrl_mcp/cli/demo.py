@@ -53,7 +53,7 @@ CONTENTS = """\
 
 @dataclass(frozen=True)
 class Policy:
-    """A line of the table.
+    """A policy in the table of results.
 
     Attributes:
         label: What the table calls it.
@@ -73,7 +73,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="torchrl-mcp-demo", description=__doc__.partition("\n")[0])
     parser.add_argument("overrides", nargs="*", help="settings of all runs, as torchrl-mcp-train takes them: seed=1")
     parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
-    parser.add_argument("--smoke", action="store_true", help="take seconds, to show that everything runs")
+    parser.add_argument("--smoke", action="store_true", help="a test of the demonstration, which takes seconds")
     arguments = parser.parse_args()
     preset = "demo_smoke" if arguments.smoke else "demo"
     try:

@@ -1,4 +1,4 @@
-"""``torchrl-mcp-evaluate``: how good is a trained policy?
+"""``torchrl-mcp-evaluate``: returns and diagnostics of a trained policy.
 
 With ``--output RUN/evaluation.json`` it leaves in a run folder what training ends with.
 """
@@ -17,7 +17,7 @@ from torchrl_mcp.training.run_folder import write_json
 
 
 def main() -> None:
-    """Play one episode in each of many environments and print what came of it."""
+    """Play one episode in each of many environments and print the statistics."""
     parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__.partition("\n")[0])
     parser.add_argument(
         "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"

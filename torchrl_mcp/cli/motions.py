@@ -187,10 +187,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
-    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who shall move (default humanoid)")
+    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who moves (default humanoid)")
     target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
-    source.add_argument("--fps", type=float, help="frames per second of the files, if not as they say (.amc: 120)")
+    source.add_argument("--fps", type=float, help="frames per second of the files, if not what they state (.amc: 120)")
     source.add_argument("--scale", type=float, help="metres per unit of length; found by the length of the legs")
     source.add_argument(
         "--map", action="append", default=[], metavar="PART=JOINT", help="which joint is a part of the body; repeatable"

@@ -1,4 +1,4 @@
-"""``torchrl-mcp-report``: what came of many runs, beside the paper's figures, as a web page and as Markdown."""
+"""``torchrl-mcp-report``: the results of many runs beside the paper's, as a web page and as Markdown."""
 
 import argparse
 import math

@@ -31,7 +31,7 @@ def run_benchmark(arguments: list[str]) -> None:
     parser.add_argument("--config-dir", "-cd", type=Path)
     options, settings = parser.parse_known_args(arguments)
     if unknown := [setting for setting in settings if setting.startswith("-")]:
-        sys.exit(f"torchrl-mcp-train: a benchmark knows settings and --config-dir, not {' '.join(unknown)}")
+        sys.exit(f"torchrl-mcp-train: a benchmark takes settings and --config-dir, but not {' '.join(unknown)}")
     if options.config_dir:
         settings.append(f"hydra.searchpath=[file://{options.config_dir.resolve()}]")
     try:

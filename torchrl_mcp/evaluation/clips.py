@@ -1,4 +1,4 @@
-"""How well a policy follows each of its reference motions."""
+"""Evaluation of a policy on each of its reference motions."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from torchrl_mcp.evaluation.rollout import evaluate
 
 @dataclass(frozen=True)
 class ClipResult:
-    """Episodes that follow one clip.
+    """Statistics of the episodes that follow one clip.
 
     Attributes:
         clip: Its name.

@@ -1,4 +1,4 @@
-"""How good is a policy? One episode in each of many environments."""
+"""Evaluation of a policy by one episode in each of many environments."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from torchrl_mcp.evaluation.statistics import mean
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes, one per environment.
+    """The outcome of one episode per environment.
 
     Attributes:
         returns: Undiscounted sum of rewards of each episode, ``(N,)``.

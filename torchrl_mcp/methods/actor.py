@@ -1,4 +1,4 @@
-"""What methods share: networks become TensorDictModules.
+"""The actor that all methods build: networks as TensorDictModules.
 
 A method first makes named *parts*, plain modules that transfer keeps, freezes or starts anew by their names, and then
 an :class:`Actor` over them: the ``policy`` that acts, and what the loss differentiates, ``trained``. Both are one and

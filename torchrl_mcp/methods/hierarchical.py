@@ -116,7 +116,7 @@ def gated_actor(
 
 
 class Clock(nn.Module):
-    """Tells when it is time for another choice."""
+    """The clock that says when the gate chooses again."""
 
     def __init__(self, steps_per_choice: int) -> None:
         """Take the number of steps from one choice to the next."""

@@ -145,7 +145,7 @@ def weights_actor(
 
 
 class ConstantScale(nn.Module):
-    """A standard deviation that depends on nothing."""
+    """A standard deviation that does not depend on the input."""
 
     def __init__(self, std: float) -> None:
         """Take the standard deviation, positive."""

@@ -1,4 +1,4 @@
-r"""The option-critic baseline: options that end when they see fit, and values that choose among them (Section E.5).
+r"""The option-critic baseline: options with learned terminations, and values that choose among them (Section E.5).
 
 .. math::
     U(\omega, s') = (1 - \beta_\omega(s')) Q_\Omega(s', \omega) + \beta_\omega(s') V_\Omega(s')

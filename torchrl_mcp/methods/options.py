@@ -68,7 +68,7 @@ class Terminations(nn.Module):
         super().__init__()
         _require_options(num_options)
         if not 0 < initial < 1:
-            raise ValueError(f"initial={initial} is no probability of termination: pass a number between 0 and 1")
+            raise ValueError(f"initial={initial} is not a probability: pass a number between 0 and 1")
         self.body = relu_mlp(observation_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
         nn.init.constant_(self.output.bias, math.log(initial / (1 - initial)))
@@ -79,7 +79,7 @@ class Terminations(nn.Module):
 
 
 class WhereBeginning(nn.Module):
-    """Evaluates scores only where an option begins: elsewhere nobody asks, and they are zero.
+    """Scores that are evaluated only where an option begins, and are zero elsewhere.
 
     Args:
         scores: From state ``(n, S)`` and goal ``(n, G)`` to ``(n, K)``.

@@ -1,4 +1,4 @@
-"""Runs side by side: which may be averaged, what tells the others apart, and what the paper says of them."""
+"""Comparison of runs: cells of seeds that may be averaged, their differences, and the paper's numbers."""
 
 import math
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""What the paper reports, to set beside our own figures.
+"""The paper's results, which the report shows beside ours.
 
 Reference:
     Peng et al., "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies", NeurIPS

@@ -1,4 +1,4 @@
-"""What run folders say of themselves: configuration, progress, evaluation and provenance."""
+"""The contents of run folders: configuration, progress, evaluation and provenance."""
 
 import csv
 import json

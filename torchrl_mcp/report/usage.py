@@ -1,4 +1,4 @@
-"""What evaluations say of gates and options: do the primitives share the work?"""
+"""Usage of gates and options in evaluations: do the primitives share the work?"""
 
 import math
 

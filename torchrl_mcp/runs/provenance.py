@@ -1,4 +1,4 @@
-"""Where a run comes from: command, code, choices and machine."""
+"""The provenance of a run: command, code, choices and machine."""
 
 import shutil
 import subprocess

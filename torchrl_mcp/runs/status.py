@@ -1,4 +1,4 @@
-"""How far are the runs of a folder?
+"""The progress of the runs of a folder.
 
 Everything is read from the run folders, so it works beside a benchmark in any process on any machine that shares them.
 """
@@ -36,7 +36,7 @@ Runs = Mapping[Path, int | None]
 
 @dataclass(frozen=True)
 class Status:
-    """How far a run is.
+    """The progress of a run.
 
     Attributes:
         folder: Its run folder.

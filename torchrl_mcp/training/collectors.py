@@ -1,4 +1,4 @@
-"""Where trajectories come from: environments in this process, or in workers on one machine or on many."""
+"""Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ Environments = CharacterEnv | TransformedCharacterEnv
 
 
 class TrajectorySource(Protocol):
-    """What the trainer asks for trajectories.
+    """The interface of trajectory sources.
 
     Attributes:
         env: Environments like those that are stepped, of any number.
@@ -67,7 +67,7 @@ class TrajectorySource(Protocol):
 
 
 class LocalSource:
-    """Steps environments of this process.
+    """A trajectory source of environments in this process.
 
     Their state is its own, so that a resumed run goes on within their episodes, to the same numbers.
 
@@ -141,7 +141,7 @@ def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) ->
 
 
 class RemoteSource:
-    """Steps environments in workers, which TorchRL starts by one of its backends, with the newest weights every time.
+    """A trajectory source of workers, started by one of TorchRL's backends, that act by the newest weights.
 
     A resumed run begins new episodes, other ones than those that it began with.
 
@@ -236,7 +236,7 @@ class RemoteSource:
 
 
 class _Autocast(TensorDictModuleBase):
-    """A policy in bfloat16 autocast, wherever it is called."""
+    """A policy that computes in bfloat16 autocast."""
 
     def __init__(self, policy: TensorDictModuleBase, device: torch.device) -> None:
         super().__init__()

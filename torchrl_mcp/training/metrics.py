@@ -10,7 +10,7 @@ from torchrl_mcp.training.run_folder import METRICS, replacing
 
 
 class MetricsWriter:
-    """Writes one row of metrics per iteration to ``metrics.csv`` and to loggers.
+    """A writer of one row of metrics per iteration, to ``metrics.csv`` and to loggers.
 
     Args:
         folder: The run folder.

@@ -27,7 +27,7 @@ from torchrl_mcp.training.transfer import FrozenParts
 
 
 class Estimator(Protocol):
-    """What makes samples for the loss from trajectories."""
+    """The interface of advantage estimators: from trajectories to samples for the loss."""
 
     out_keys: Sequence[NestedKey]
 

@@ -1,4 +1,4 @@
-"""Films of policies at work."""
+"""Films of policies."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -110,16 +110,16 @@ def save_film(
             that is not installed.
     """
     if path.suffix not in EVERY:
-        raise ValueError(f"{path} is no film: call it .gif or .mp4")
+        raise ValueError(f"{path} is not the name of a film: end it with .gif or .mp4")
     save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
     player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
     every = EVERY[path.suffix]
     interval = every * player.env.control_timestep
     if round(seconds / player.env.control_timestep) < every:
-        raise ValueError(f"seconds={seconds} leaves no time for a picture: pass at least {interval:.2f}")
+        raise ValueError(f"seconds={seconds} is too short for a picture: pass at least {interval:.2f}")
     if width < 2 or height < 2:
-        raise ValueError(f"width={width} and height={height} are no size of a picture: pass at least 2 pixels each")
+        raise ValueError(f"width={width} and height={height} are too small for a picture: pass at least 2 pixels each")
     pictures = film(player, seconds=seconds, width=width, height=height, every=every)
     save(pictures, path, interval=interval)
 

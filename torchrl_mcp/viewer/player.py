@@ -1,4 +1,4 @@
-"""A policy at work, step by step, to be looked at."""
+"""The player that viewers share: a policy in one simulation, step by step."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 
 
 class Weights(NamedTuple):
-    """How much each of the primitives has to say.
+    """The weight of each primitive.
 
     Args:
         title: What they are.
@@ -26,7 +26,7 @@ class Weights(NamedTuple):
 
 
 class Player:
-    """Plays the first of a batch of simulations; an episode that ends is followed by another.
+    """A policy playing the first of a batch of simulations, episode after episode.
 
     Args:
         policy: From what the environment shows to ``action``, on the CPU.

@@ -1,4 +1,4 @@
-"""MuJoCo Studio's web viewer, with what it does not know of: ghosts, arrows and the weights of primitives."""
+"""MuJoCo Studio's web viewer with ghosts, arrows and the weights of primitives added."""
 
 import time
 
@@ -68,7 +68,7 @@ class Stage(viewer_app.ViewerApp):
 
 
 class Pace(plugin.SimPlugin):
-    """What the viewer's controls say of the pace.
+    """The pace that the viewer's controls set.
 
     Attributes:
         paused: Whether to wait.
