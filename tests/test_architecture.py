@@ -24,20 +24,7 @@ ORDER = (
 RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folders}
 HYDRA = {"torchrl_mcp.runs.build", "torchrl_mcp.runs.benchmark"}
 """Modules beside those of ``cli`` that may import Hydra: one makes what it configures, one drives its launchers."""
-WITHOUT_HYDRA = (
-    *("distributions", "modules", "methods", "objectives", "evaluation", "training"),
-    *("envs", "analysis", "viewer"),
-)
-    "distributions",
-    "modules",
-    "methods",
-    "objectives",
-    "evaluation",
-    "training",
-    "envs",
-    "analysis",
-    "viewer",
-)
+WITHOUT_HYDRA = {folder for folders in ORDER[:6] for folder in folders} | {"analysis", "viewer", "envs"}
 RESTORING = {"torchrl_mcp.analysis.checkpoints"}
 """Modules of theirs that restore runs, by way of ``runs.build``."""
 
