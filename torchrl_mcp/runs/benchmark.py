@@ -90,8 +90,8 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     """Return all runs of the benchmark ``master.benchmark`` as the command line has it, pre-training first.
 
     An argument of the command line that rows have as well, such as ``task=heading``, selects rows; any other sets a
-    setting of all runs, to one value or to several. A run whose method keeps something transfers from the pre-training of
-    the same settings, which others may share.
+    setting of all runs, to one value or to several. A run whose method keeps something transfers from the pre-training
+    of the same settings, which others may share.
 
     Raises:
         ValueError: If there are none, or two of different settings would share a folder.

@@ -171,9 +171,9 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
-    """Return the :func:`~torchrl_mcp.evaluation.rollout.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+    """Return what a run's policy achieves, ``deterministic`` and ``stochastic``.
 
-    Each has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+    Each is a :func:`~torchrl_mcp.evaluation.rollout.summary` and has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
     Args:
         path: Run folder, of which the newest checkpoint counts, or checkpoint file.
