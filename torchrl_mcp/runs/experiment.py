@@ -173,7 +173,8 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
     """Return what a run's policy achieves, ``deterministic`` and ``stochastic``.
 
-    Each is a :func:`~torchrl_mcp.evaluation.rollout.summary` and has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+    Each is a :func:`~torchrl_mcp.evaluation.rollout.summary`, with the
+    :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
     Args:
         path: Run folder, of which the newest checkpoint counts, or checkpoint file.
