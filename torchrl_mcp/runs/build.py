@@ -55,11 +55,10 @@ def require_environment(cfg: DictConfig) -> None:
     # The motions of a character of your own may be what introduces it, so all that is named is imported.
     named = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
     environment, *_ = [get_object(name) for name in named]
-    able: Sequence[str] = getattr(environment, "characters", tuple)()
+    able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
-        raise ValueError(
-            f"no environment has task={task} with character={character}: pass character={' or '.join(able)}"
-        )
+        known = " or ".join(able)
+        raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
@@ -195,12 +194,11 @@ def launched() -> tuple[list[str], dict[str, str]]:
 
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:
-    """Return the arguments of a class or function by name, with those of the classes that it derives from."""
+    """Return the arguments of a class or function by name, with those that a class passes on to its bases."""
     made = get_object(name)
-    inherited = [vars(kind)["__init__"] for kind in getattr(made, "__mro__", ()) if "__init__" in vars(kind)]
-    makers = inherited or [made]
+    kinds = made.__mro__ if inspect.isclass(made) else ()
     found: dict[str, inspect.Parameter] = {}
-    for maker in makers:
+    for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
         parameters = inspect.signature(maker).parameters
         found = {**parameters, **found}
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
