@@ -101,9 +101,9 @@ def test_what_changes_no_learning_parts_no_seeds(write_run, setting):
 
 def test_an_argument_that_only_some_runs_name_tells_them_apart(write_run):
     made = {"task__transfer___target_": "torchrl_mcp.envs.Heading"}
-    usual, other = grouped(write_run("a", **made), write_run("b", seed=1, **made, task__transfer__max_turn=0.3))
-    assert usual.settings == {"task.transfer.max_turn": "default"}
-    assert other.settings == {"task.transfer.max_turn": 0.3}
+    found = grouped(write_run("a", **made), write_run("b", seed=1, **made, task__transfer__max_turn=0.3))
+    told = {cell.runs[0].seed: cell.settings for cell in found}
+    assert told == {0: {"task.transfer.max_turn": "default"}, 1: {"task.transfer.max_turn": 0.3}}
 
 
 def test_only_complete_runs_count_and_the_others_are_remarked(write_run):
