@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
+from torchrl_mcp.runs.configuration import about_method
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, ORIGIN
 
 MODES = ("deterministic", "stochastic")
@@ -71,6 +72,17 @@ class Run:
     def method(self) -> str:
         """Name of the method."""
         return self.settings["method.name"]
+
+    @property
+    def title(self) -> str:
+        """Title of the method."""
+        return self.settings.get("method.title", self.method)
+
+    @property
+    def standard(self) -> dict[str, Any]:
+        """Settings by which the method is known."""
+        prefix = "method.standard."
+        return {name.removeprefix(prefix): x for name, x in self.settings.items() if name.startswith(prefix)}
 
     @property
     def stage(self) -> str:
@@ -142,6 +154,8 @@ def read_run(folder: Path) -> Run | Damaged:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
     if (total := settings["training.total_frames"]) < 1:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
+    if "method.title" not in settings:  # the run is older than what methods tell about themselves
+        settings = dict(_leaves(about_method(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (ORIGIN, _origin)):

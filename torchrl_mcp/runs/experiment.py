@@ -2,18 +2,16 @@
 
 import json
 import math
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 from torchrl.record.loggers.common import Logger
 
+from torchrl_mcp.runs.configuration import completed, of_checkpoint
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.runs.build import Agent, make_agent, make_source, make_env, make_trainer
@@ -25,9 +23,6 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs.provenance import origin
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
 from torchrl_mcp.training.trainer import Trainer
-
-USUAL = ("collector", "evaluation")
-"""Settings that not all runs had from the beginning."""
 
 
 def train(cfg: DictConfig) -> Path:
@@ -72,18 +67,14 @@ def resume(folder: Path) -> Path:
 
 
 def configuration(folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder``; if it is from before ``USUAL``, they are as in a new run.
+    """Return the configuration of the run in ``folder``, :func:`~torchrl_mcp.runs.configuration.completed`.
 
     Raises:
         ValueError: If the folder holds no run.
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
-    cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
-    if missing := [key for key in USUAL if key not in cfg]:
-        usual = _usual(cfg.task.name)
-        cfg.update({key: usual[key] for key in missing})
-    return cfg
+    return completed(cast("DictConfig", OmegaConf.load(folder / CONFIG)))
 
 
 def is_complete(folder: Path) -> bool:
@@ -114,7 +105,7 @@ def restore(
         ValueError: If there is no checkpoint or it is damaged.
     """
     file = checkpoint.find(path)
-    cfg = OmegaConf.create(dict(checkpoint.configuration(file)))
+    cfg = of_checkpoint(file)
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
     agent = make_agent(cfg, env)
@@ -153,8 +144,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
     Raises:
         ValueError: If there is no checkpoint or it is damaged.
     """
-    cfg = OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
-    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual(cfg.task.name)["evaluation"], resolve=True)
+    settings: Any = OmegaConf.to_container(of_checkpoint(path).evaluation, resolve=True)
     environment = settings["environment"]
     numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
     return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
@@ -219,14 +209,6 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
         _write(numbers, folder / EVALUATION)
-
-
-def _usual(task: str) -> dict[str, DictConfig]:
-    """Return what a new run on a task has of ``USUAL``."""
-    begun = GlobalHydra.instance().is_initialized()  # on the command line
-    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [f"task={task}"])
-        return {key: cfg[key] for key in USUAL}
 
 
 def _write(content: dict[str, Any], path: Path) -> None:
