@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
@@ -102,13 +103,22 @@ def restore(
         **kwargs: Arguments of the environments that replace the run's own.
 
     Raises:
-        ValueError: If there is no checkpoint or it is damaged.
+        ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
     """
     file = checkpoint.find(path)
     cfg = of_checkpoint(file)
     cfg.device = device
-    env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
-    agent = make_agent(cfg, env)
+    try:
+        env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
+        agent = make_agent(cfg, env)
+    except InstantiationException as error:
+        if not isinstance(error.__cause__, ImportError):
+            raise
+        reason = str(error.__cause__).partition("\n")[0].rstrip(":")
+        raise ValueError(
+            f"{path} was made with code that Python does not find: {reason}. If it is yours, add its folder to "
+            "PYTHONPATH; if it is the library's, take the version that wrote the checkpoint"
+        ) from error
     checkpoint.load_agent(agent.parts, file)
     return cfg, agent, env
 
