@@ -20,7 +20,6 @@ from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curv
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import Cell, cells
 from torchrl_mcp.report.results import MODES, Run, find_runs
-from torchrl_mcp.report.sections import method_title
 from torchrl_mcp.runs.tables import text_table
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -105,9 +104,9 @@ def line(cell: Cell, name: str) -> dict[str, Any]:
 def title(cell: Cell, usual: int | None) -> str:
     """Return the name of a method, and what it transfers from if that is not the usual pre-training."""
     if cell.choices["pretrained"]:
-        return f"{method_title(cell.method)}, built in"
+        return f"{cell.title}, built in"
     steps = budget(cell)
-    return method_title(cell.method) + (f", {steps / 1e6:g} M" if steps and steps != usual else "")
+    return cell.title + (f", {steps / 1e6:g} M" if steps and steps != usual else "")
 
 
 def budget(cell: Cell) -> int | None:

@@ -227,6 +227,20 @@ def test_a_benchmark_does_not_touch_runs_of_another_version(evaluated, tmp_path)
         benchmark.conflict(job)
 
 
+def test_a_run_of_before_methods_told_about_themselves_is_completed_with_its_own_networks(tmp_path):
+    cfg = configure("method=mcp", "num_primitives=4", "gating=softmax")
+    expected = OmegaConf.to_container(cfg, resolve=True)["method"]
+    del cfg.method
+    cfg.method = {"name": "mcp"}
+    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
+    found = OmegaConf.to_container(experiment.configuration(tmp_path), resolve=True)["method"]
+    assert (found["title"], found["standard"], found["explorer"]) == tuple(
+        expected[key] for key in ("title", "standard", "explorer")
+    )
+    assert found["explorer"]["num_primitives"] == 4
+    assert found["explorer"]["gate_activation"]["_target_"] == "torch.nn.Softmax"
+
+
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():
     for method in ("mcp", "finetune", "hierarchical"):
         evaluation = configure("task=imitation", "character=biped", f"method={method}", "preset=fast").evaluation

@@ -64,3 +64,9 @@ def test_bars_stay_in_the_upper_left_corner():
     changed = np.nonzero((drawn([1.0] * 8) != 255).any(-1))
     assert changed[0].max() < 440 / 2
     assert changed[1].max() < 440 / 2
+
+
+def test_eight_primitives_have_eight_colours():
+    pixels = drawn([1.0] * 8)
+    assert len(set(COLOURS)) == 8
+    assert all(len(where(pixels, colour)[0]) > 0 for colour in COLOURS)

@@ -123,7 +123,7 @@ def require_early_checkpoint(runs: Runs) -> None:
     if steps % between and steps != _steps(scratch):
         raise ValueError(
             f"transfer ends after {steps} steps, and scratch has no checkpoint there to compare with, only one every "
-            f"{between}: make demo.frames.mcp.transfer a multiple of that, or checkpoint_interval smaller"
+            f"{between}: make budget.transfer a multiple of that, or checkpoint_interval smaller"
         )
 
 

@@ -19,7 +19,7 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories
 from torchrl_mcp.analysis.walk_cycle import draw_walk_cycle
 from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, specialisation
-from torchrl_mcp.report.paper import CHARACTERS, METHODS
+from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import PREFIX, locate
 from torchrl_mcp.runs.tables import text_table
@@ -35,8 +35,6 @@ examples:
   {PROGRAM} exploration {PREFIX}humanoid runs/latent-humanoid   # Figure 6
   {PROGRAM} primitives {PREFIX}biped {PREFIX}humanoid          # Figure 7
 """
-
-USUAL_MIXERS = {"mcp": "multiplicative", "moe": "additive"}
 
 PAPER = """\
 The paper (section 5.4) gives no numbers. It reports that weights "show a strong correlation to the phase of a walk
@@ -99,7 +97,7 @@ def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], st
     panels: dict[str, Exploration] = {}
     for name, cfg, agent in runs:
         explorer = checkpoints.explorer(cfg, agent, num, torch.Generator().manual_seed(seed))
-        label = checkpoints.EXPLORING[cfg.method.name]
+        label = checkpoints.explorer_title(cfg)
         label = f"{label} ({name})" if label in panels else label
         panels[label] = exploration.explore(explorer, agent.parts["observation_normaliser"], env, start)
     generator = torch.Generator().manual_seed(seed)
@@ -117,7 +115,7 @@ def analyse(arguments: argparse.Namespace) -> None:
             path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
         )
         stem = arguments.output / f"primitives_{name}"
-        title = f"{METHODS[cfg.method.name]}, {CHARACTERS[cfg.character.name]}"
+        title = f"{cfg.method.title}, {CHARACTERS[cfg.character.name]}"
         title += f", walking {arguments.clip or 'straight ahead'}"
         _save(draw_walk_cycle(walk, untrained, title=title), stem)
         _write(cycle_rows(walk), stem, "weights")
@@ -148,13 +146,13 @@ def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
 
 
 def _label(cfg: DictConfig) -> str:
-    """Name of a method, with what of it is unusual."""
+    """Title of a method, with its mixer and exploration if they are not its standard."""
     details = []
-    if cfg.method.name in USUAL_MIXERS and cfg.mixer.name != USUAL_MIXERS[cfg.method.name]:
+    if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
         details.append(cfg.mixer.name)
     if cfg.stage.name == "transfer" and cfg.get("exploration", {}).get("name") == "weights":
         details.append("over weights")
-    return " ".join([METHODS[cfg.method.name], *details])
+    return " ".join([cfg.method.title, *details])
 
 
 def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:

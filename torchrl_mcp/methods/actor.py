@@ -36,6 +36,12 @@ PRIMITIVES = (("primitives", "loc"), ("primitives", "scale"))
 
 Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
 
+Explorer = Callable[[Tensor], Tensor]
+"""From normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal: random exploration of Section 5.3.
+
+A method names as ``method.explorer`` what makes one from its parts, the number N and a generator.
+"""
+
 
 @dataclass(frozen=True)
 class Actor:

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Collection
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.methods.options import OptionActor, WhereBeginning, keep_option
+from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import OptionActor, RandomSequence, WhereBeginning, keep_option
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 
@@ -113,6 +114,21 @@ def gated_actor(
         *_acting(parts),
     )
     return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
+
+
+def random_sequence(
+    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
+) -> Explorer:
+    """Return an explorer that lets one primitive act after another in random order.
+
+    Args:
+        parts: Made by :func:`primitive_parts`.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_options: Number of primitives, ``K``.
+        steps: Control steps for which each acts.
+    """
+    return RandomSequence(parts["primitives"], num, generator, num_options=num_options, steps=steps)
 
 
 class Clock(nn.Module):

@@ -97,6 +97,38 @@ class WhereBeginning(nn.Module):
         return scores
 
 
+class RandomSequence:
+    """An explorer that lets one option act after another in random order, and plays mean actions.
+
+    Args:
+        options: From states and the options that act, ``(N,)``, to means and standard deviations, each ``(N, A)``.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_options: Number of options, ``K``.
+        steps: Control steps for which each acts.
+    """
+
+    def __init__(
+        self,
+        options: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        num: int,
+        generator: torch.Generator,
+        *,
+        num_options: int,
+        steps: int,
+    ) -> None:
+        self._options, self._num, self._generator = options, num, generator
+        self._num_options, self._steps = num_options, steps
+        self._elapsed, self._option = 0, torch.zeros(num, dtype=torch.int64)
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Return the actions of the next step, ``(N, A)``, from states ``(N, S)``."""
+        if self._elapsed % self._steps == 0:
+            self._option = torch.randint(self._num_options, (self._num,), generator=self._generator)
+        self._elapsed += 1
+        return self._options(state, self._option)[0]
+
+
 class EpsilonGreedy(Categorical):
     r"""The policy over options that values define: the best one, or with probability :math:`\epsilon` any.
 

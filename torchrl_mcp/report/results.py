@@ -6,14 +6,17 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
+from torchrl_mcp.runs import build
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE
 
 MODES = ("deterministic", "stochastic")
@@ -71,6 +74,17 @@ class Run:
     def method(self) -> str:
         """Name of the method."""
         return self.settings["method.name"]
+
+    @property
+    def title(self) -> str:
+        """Title of the method."""
+        return self.settings.get("method.title", self.method)
+
+    @property
+    def standard(self) -> dict[str, Any]:
+        """Settings by which the method is known."""
+        prefix = "method.standard."
+        return {name.removeprefix(prefix): x for name, x in self.settings.items() if name.startswith(prefix)}
 
     @property
     def stage(self) -> str:
@@ -142,6 +156,8 @@ def read_run(folder: Path) -> Run | Damaged:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
     if (total := settings["training.total_frames"]) < 1:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
+    if "method.title" not in settings:  # the run is older than what methods tell about themselves
+        settings = dict(_leaves(_about(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
@@ -203,3 +219,13 @@ def _line(error: Exception) -> str:
     """The first line of an error's message."""
     message = str(error).partition("\n")[0] or type(error).__name__
     return f"it lacks {message}" if isinstance(error, KeyError) else message
+
+
+@cache
+def _about(method: str) -> dict[str, Any]:
+    """Return what the library's method of a name tells about itself, or nothing of a method that it does not have."""
+    if method not in {
+        file.name.removesuffix(".yaml") for file in files("torchrl_mcp.conf").joinpath("method").iterdir()
+    }:
+        return {}
+    return cast("dict[str, Any]", OmegaConf.to_container(build.compose_run(f"method={method}").method, resolve=True))

@@ -62,21 +62,26 @@ def require_environment(cfg: DictConfig) -> None:
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
-    """Check that this version has all of the library that the configuration of a run names.
+    """Check that everything is there that the configuration of a run names.
 
     Args:
         config: The configuration.
         source: The file that holds it.
 
     Raises:
-        ValueError: If it does not.
+        ValueError: If something is not.
     """
     for name in targets(config):
-        if name.startswith("torchrl_mcp.") and not _exists(name):
+        if _exists(name):
+            continue
+        if name.startswith("torchrl_mcp."):
             raise ValueError(
                 f"{source} is of another version of torchrl-mcp: it names {name}, which this version does not have. "
                 "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
             )
+        raise ValueError(
+            f"{source} names {name}, which Python does not find: if the module is yours, add its folder to PYTHONPATH"
+        )
 
 
 def targets(config: Any) -> Iterator[str]:

@@ -119,7 +119,7 @@ def restore(
         **kwargs: Arguments of the environments that replace the run's own.
 
     Raises:
-        ValueError: If there is no checkpoint or it is damaged.
+        ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
     """
     file = checkpoint.find(path)
     cfg = policy_config(file)
