@@ -169,8 +169,8 @@ def read_run(folder: Path) -> Run | Damaged:
 
 
 def _run_folders(path: Path) -> Iterator[Path]:
-    for folder, subfolders, files in os.walk(path):
-        if CONFIG in files or METRICS in files:
+    for folder, subfolders, names in os.walk(path):
+        if CONFIG in names or METRICS in names:
             subfolders.clear()
             yield Path(folder)
         subfolders[:] = [name for name in subfolders if not name.startswith(".")]
@@ -224,8 +224,7 @@ def _line(error: Exception) -> str:
 @cache
 def _about(method: str) -> dict[str, Any]:
     """Return what the library's method of a name tells about itself, or nothing of a method that it does not have."""
-    if method not in {
-        file.name.removesuffix(".yaml") for file in files("torchrl_mcp.conf").joinpath("method").iterdir()
-    }:
+    known = files("torchrl_mcp.conf").joinpath("method").iterdir()
+    if f"{method}.yaml" not in {file.name for file in known}:
         return {}
     return cast("dict[str, Any]", OmegaConf.to_container(build.compose_run(f"method={method}").method, resolve=True))

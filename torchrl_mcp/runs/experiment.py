@@ -161,10 +161,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
     Raises:
         ValueError: If there is no checkpoint or it is damaged.
     """
-    cfg = policy_config(path)
-    # The networks that come with the library are older than this setting.
-    setting = cfg.get("evaluation") or build.compose_run(f"task={cfg.task.name}").evaluation
-    settings: Any = OmegaConf.to_container(setting, resolve=True)
+    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     environment = settings["environment"]
     numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
     return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
