@@ -47,6 +47,9 @@ CLEARANCE = (
 )
 """Height of the foot's lowest point in metres. The heel arrives with a little speed, as heels do."""
 
+ASIDE = ((0.57, 0.0), (0.80, 0.04), (1.03, 0.0))
+"""Metres by which a foot swings outwards around the other leg in a curve, where that one points across its way."""
+
 ROUNDING = ((0.80, 0.0), (0.90, 0.2), (1.02, 0.0))
 """Angle in radians within which the lowest point of a swinging foot passes smoothly from toe to heel."""
 

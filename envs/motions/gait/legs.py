@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv1d, max_pool1d, pad
+from torch.nn.functional import conv1d, max_pool1d, pad, softplus
 
 from torchrl_mcp.envs.motions.gait.course import SIDES, Course, Side, between_frames
 from torchrl_mcp.envs.motions.gait.curves import Spline
@@ -31,6 +31,9 @@ RELIEF = 0.16
 
 OUTWARD = 0.7
 """Part of the angle between pelvis and foot that the hip turns, the rest being the ankle's."""
+
+INWARD = 0.1
+"""Angle in radians by which a foot may turn in and the hip with it; the ankle turns the rest, or knees would cross."""
 
 
 class Leg(NamedTuple):
@@ -100,7 +103,8 @@ def reach(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, forwar
     """
     line = root + leg.hip_offset(side, pelvis) - foot.ankle
     length = torch.linalg.vector_norm(line, dim=-1)
-    heading = forward + OUTWARD * (foot.heading - forward)
+    outward = softplus(side.sign * (foot.heading - forward) + INWARD, beta=1 / INWARD) - INWARD
+    heading = forward + OUTWARD * side.sign * outward
     x, y, z = (rotate(about_z(-heading), line) / length.unsqueeze(-1)).unbind(-1)
     limb = multiply(about_z(heading), multiply(about_y(torch.atan2(x, z)), about_x(-y.asin())))
     length = length.clamp_max(float(leg.reach(torch.deg2rad(torch.tensor(1.0)))))
