@@ -12,7 +12,7 @@ from torchrl_mcp.envs.motions.capture.build import HUMANS
 from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
-from torchrl_mcp.envs.motions.inspection.summary import Summary, summary
+from torchrl_mcp.envs.motions.inspection.summary import Summary, summarised
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -143,7 +143,7 @@ def _save(clips: Mapping[str, MotionClip], folder: Path) -> None:
 
 def _table(clips: Mapping[str, MotionClip]) -> str:
     """Return a line for each clip, and warn of those whose feet slide."""
-    summaries = {name: summary(clip) for name, clip in clips.items()}
+    summaries = {name: summarised(clip) for name, clip in clips.items()}
     rows = [COLUMNS, *(_row(name, clip, summaries[name]) for name, clip in clips.items())]
     rows.append(("total", "", f"{sum(numbers.duration for numbers in summaries.values()):.1f}", *[""] * 7))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

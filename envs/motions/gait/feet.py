@@ -14,8 +14,8 @@ from torchrl_mcp.envs.motions.gait.curves import (
     MID_STANCE,
     ROUNDING,
     TOE_OFF,
-    Spline,
     settled,
+    spline,
 )
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.rotations import about_y, about_z, multiply
@@ -96,12 +96,12 @@ def step(course: Course, side: Side, sole: Sole) -> Foot:
     distance, turn = torch.linalg.vector_norm(end - start, dim=-1), end_heading - start_heading
     vigour, stepping = settled(distance, LONG), settled(torch.hypot(distance, STEP_WIDTH * turn), SHORT)
 
-    position, heading = _foothold(course, side, last + Spline(ADVANCE)(phase) * (following - last))
-    pitch = _rolling(course, side, phase) * torch.deg2rad(Spline(FOOT_PITCH)(phase))
-    ahead, height = rolled(pitch, sole, vigour * Spline(ROUNDING)(phase))
-    height = height + Spline(CLEARANCE)(phase) * (0.4 * stepping + 0.6 * vigour)
+    position, heading = _foothold(course, side, last + spline(ADVANCE, phase) * (following - last))
+    pitch = _rolling(course, side, phase) * torch.deg2rad(spline(FOOT_PITCH, phase))
+    ahead, height = rolled(pitch, sole, vigour * spline(ROUNDING, phase))
+    height = height + spline(CLEARANCE, phase) * (0.4 * stepping + 0.6 * vigour)
     outward = side.sign * direction(heading + torch.pi / 2)
-    aside = Spline(ASIDE)(phase) * stepping * settled(course.turn_rate, CURVED)
+    aside = spline(ASIDE, phase) * stepping * settled(course.turn_rate, CURVED)
     ground = position + ahead.unsqueeze(-1) * direction(heading) + aside.unsqueeze(-1) * outward
     return Foot(
         heading=heading,
