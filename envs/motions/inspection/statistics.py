@@ -85,6 +85,16 @@ class GaitStatistics(NamedTuple):
     toe_clearance: Tensor
     slide: Tensor
 
+    @property
+    def stride_length(self) -> Tensor:
+        """Way along the heading in a stride, in metres."""
+        return self.speed * self.stride_time
+
+    @property
+    def cadence(self) -> Tensor:
+        """Steps per minute: two for each stride."""
+        return 120 / self.stride_time
+
     def select(self, strides: Tensor) -> "GaitStatistics":
         """Keep the strides of a mask, shape ``(S,)``."""
         return GaitStatistics(*(field[strides] for field in self))
