@@ -3,10 +3,10 @@
     python benchmarks/legs_apart.py    # a few minutes, writes results/legs_apart.csv
 
 Characters do not collide with themselves, so nothing keeps their legs apart but the motions that they imitate. For
-every character: the signed distance between the legs' collision shapes (``mj_geomDistance``), over the generated corpus, and
-over episodes in which the networks that come with the library follow it, as they are evaluated. ``deepest_mm`` is the
-greatest depth in millimetres, the others are shares of the frames in which the legs are in each other, and deeper than
-1 and 2 cm.
+every character: the signed distance between the legs' collision shapes (``mj_geomDistance``), over the generated
+corpus, and over episodes in which the networks that come with the library follow it, as they are evaluated.
+``deepest_mm`` is the greatest depth in millimetres, the others are shares of the frames in which the legs are in each
+other, and deeper than 1 and 2 cm.
 
 ``--quick`` takes seconds, measures less and writes nothing unless given ``--output``.
 """
