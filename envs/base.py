@@ -17,6 +17,9 @@ from torchrl_mcp.envs.simulation import LARGEST, Simulation
 ALL = slice(None)
 """All simulations, as an index that takes no copy."""
 
+_IRREGULAR = frozenset({"next", "_step"})
+"""Entries by which the caller of a step prescribes its outcome, or who takes part."""
+
 
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
@@ -168,6 +171,22 @@ class CharacterEnv(EnvBase):
         drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
         self.generator.manual_seed(drawn)
 
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step all simulations and begin new episodes where they have ended; see ``EnvBase.step_and_maybe_reset``.
+
+        The same as TorchRL's, but for what is known here: specs hold by construction, and what :meth:`_emit` tells
+        after a partial reset is what is shown of all simulations, so that nothing needs merging.
+        """
+        if tensordict.batch_size != self.batch_size or not _IRREGULAR.isdisjoint(tensordict.keys()):
+            return super().step_and_maybe_reset(tensordict)
+        outcome = self._step(tensordict)
+        tensordict.set("next", outcome)
+        state = self._step_mdp(tensordict)
+        ended = outcome["done"].view(self.num_envs).nonzero().squeeze(-1)
+        if len(ended):
+            state.update(self._begin_episodes(ended, {}))
+        return tensordict, state
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["action"]
         expected = (self.num_envs, self.simulation.model.nu)
@@ -191,7 +210,10 @@ class CharacterEnv(EnvBase):
             snapshot, self._snapshot = self._snapshot, None
             return self._reset(snapshot, set_state=True)
         ids = torch.arange(self.num_envs) if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
-        state = self._checked(tensordict, ids) if set_state else {}
+        return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
+
+    def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
+        """Begin episodes in the simulations ``ids``; what their ``state`` does not say is drawn."""
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
             state = {**self._sample(len(ids)), **state}
