@@ -13,6 +13,9 @@ from torchrl_mcp.envs.motions.kinematics import BodyStates
 SIZES = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
 """What is seen of a body, in this order: 13 numbers."""
 
+_TURNS = np.array([1.0, 1.0, 1.0, 0.5, 0.5], np.float32).reshape(5, 1, 1, 1)
+"""By how many times the heading pairs of components turn: of three vectors, and two of a quaternion."""
+
 
 def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -> Tensor:
     """Bodies as seen from a place and a heading: position, orientation, linear and angular velocity of each.
@@ -61,16 +64,17 @@ def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
     \sin)`: of a vector (x, y) by :math:`\psi`, of a quaternion (w, z) and (x, y) by :math:`\psi / 2`.
     """
     positions, orientations, linear, angular = (_planes(field) for field in bodies)
-    origin, pairs = _planes(origin.unsqueeze(-2)), np.empty((5, 2, *positions[:, 0].shape), positions.dtype)
+    origin = origin.numpy().reshape(-1, 3).T[None]
+    pairs = np.empty((5, 2, *positions[:, 0].shape), positions.dtype)
     np.subtract(_pair(positions), _pair(origin), out=pairs[0])
     pairs[1], pairs[2] = _pair(linear), _pair(angular)
     pairs[3], pairs[4] = orientations[:, ::3].swapaxes(0, 1), orientations[:, 1:3].swapaxes(0, 1)
-    turns = angle.reshape(1, -1) * angle.new_tensor([1, 1, 1, 0.5, 0.5]).unsqueeze(-1)
-    across = pairs[:, ::-1] * turns.sin().numpy()[:, None, None]
-    pairs *= turns.cos().numpy()[:, None, None]
+    turns = torch.from_numpy(angle.numpy().reshape(-1) * _TURNS)
+    across = pairs[:, ::-1] * turns.sin().numpy()
+    pairs *= turns.cos().numpy()
     pairs[:, 0] += across[:, 0]
     pairs[:, 1] -= across[:, 1]
-    pairs[3:] *= np.where(pairs[3, 0] < 0, -1, 1).astype(pairs.dtype)
+    pairs[3:] *= np.copysign(1, pairs[3, 0])
     seen = np.empty((len(positions), 13, positions.shape[-1]), positions.dtype)
     for pair, rows in zip(pairs, (slice(0, 2), slice(7, 9), slice(10, 12), slice(3, 7, 3), slice(4, 6)), strict=True):
         seen[:, rows] = pair.swapaxes(0, 1)
@@ -81,7 +85,8 @@ def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
 
 def _planes(field: Tensor) -> np.ndarray:
     """A view of L vectors for each of n simulations, shape ``(*B, L, C)``, as ``(L, C, n)``."""
-    return field.reshape(-1, *field.shape[-2:]).permute(1, 2, 0).numpy()
+    array = field.numpy()
+    return array.reshape(-1, *array.shape[-2:]).transpose(1, 2, 0)
 
 
 def _pair(vectors: np.ndarray) -> np.ndarray:

@@ -94,7 +94,10 @@ class PDCharacterEnv(CharacterEnv):
         bodies, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
         self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
         self._com = outputs["subtree_com"][:, 1]
-        self._heights, self._verticals = outputs["geom_xpos"].numpy()[..., 2], outputs["geom_xmat"].numpy()[..., 6:]
+        self._geom_heights = outputs["geom_xpos"].numpy()[..., 2]
+        # Rows by numbers, component by component: several times as fast as the rows of matrices.
+        self._geom_axes = outputs["geom_xmat"].numpy().reshape(num_envs, -1)
+        self._vertical = (9 * self._falling[0] + [[6], [7], [8]]).flatten()
         self._array_type = torch.empty(0, dtype=self._dtype).numpy().dtype
         self._look_at(bodies)
 
@@ -104,8 +107,8 @@ class PDCharacterEnv(CharacterEnv):
 
     def fallen(self) -> Tensor:
         """Whether a body other than the feet touches the ground, shape ``(N,)``, bool."""
-        geoms, half_sizes, radii = self._falling
-        heights, vertical = self._heights[:, geoms], self._verticals[:, geoms]
+        heights, half_sizes, radii = self._geom_heights[:, self._falling[0]], *self._falling[1:]
+        vertical = self._geom_axes[:, self._vertical].reshape(len(heights), 3, -1).swapaxes(1, 2)
         return torch.from_numpy((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
 
     def _com_velocity(self) -> Tensor:
