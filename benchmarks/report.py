@@ -37,6 +37,16 @@ def about() -> dict[str, str | int]:
     }
 
 
+def instructions() -> str:
+    """Return the sets of instructions of this processor that matter to tensors, as Linux names them."""
+    wide = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_bf16")
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        flags = next(line.split(":")[1].split() for line in lines if line.startswith("flags"))
+        return " ".join(flag for flag in wide if flag in flags)
+    return ""
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows of one set of keys as text, a line each."""
     lines = [list(rows[0]), *([str(value) if value != "" else "-" for value in row.values()] for row in rows)]

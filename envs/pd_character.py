@@ -97,7 +97,7 @@ class PDCharacterEnv(CharacterEnv):
         self._geom_heights = outputs["geom_xpos"].numpy()[..., 2]
         # Rows by numbers, component by component: several times as fast as the rows of matrices.
         self._geom_axes = outputs["geom_xmat"].numpy().reshape(num_envs, -1)
-        self._vertical = (9 * self._falling[0] + [[6], [7], [8]]).flatten()
+        self._vertical_columns = (9 * self._falling[0] + [[6], [7], [8]]).flatten()
         self._array_type = torch.empty(0, dtype=self._dtype).numpy().dtype
         self._look_at(bodies)
 
@@ -108,7 +108,7 @@ class PDCharacterEnv(CharacterEnv):
     def fallen(self) -> Tensor:
         """Whether a body other than the feet touches the ground, shape ``(N,)``, bool."""
         heights, half_sizes, radii = self._geom_heights[:, self._falling[0]], *self._falling[1:]
-        vertical = self._geom_axes[:, self._vertical].reshape(len(heights), 3, -1).swapaxes(1, 2)
+        vertical = self._geom_axes[:, self._vertical_columns].reshape(len(heights), 3, -1).swapaxes(1, 2)
         return torch.from_numpy((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
 
     def _com_velocity(self) -> Tensor:
