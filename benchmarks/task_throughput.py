@@ -192,7 +192,7 @@ def main() -> None:
     if arguments.job:
         print(json.dumps(measure(*json.loads(arguments.job))))
         return
-    sizes, turns, steps = ([8], 2, 3) if arguments.quick else (list(SIZES), 10, 25)
+    sizes, turns, steps = ([8], 2, 3) if arguments.quick else (list(SIZES), 6, 25)
     characters = arguments.characters[:1] if arguments.quick else arguments.characters
     conditions = {"turns": turns, "steps": steps, "threads": arguments.threads, **about(), "flags": instructions()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()))

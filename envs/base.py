@@ -44,8 +44,8 @@ class CharacterEnv(EnvBase):
         persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         current: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         dtype: Type of what is emitted; physics and reward are computed in float64.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (TorchRL merges what a partial
-            reset emits into new tensors, which are not pinned.)
+        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
+            TorchRL merges what a partial reset emits into new tensors, which are not pinned.)
 
     Raises:
         ValueError: If an argument is out of range.
@@ -243,7 +243,10 @@ class CharacterEnv(EnvBase):
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
         """What is told of all simulations, of which only ``ids`` have changed since the last time."""
         for key, value in self._observe(ids).items():
-            self._observed[key][ids] = value.to(self._type(value))
+            if isinstance(ids, slice):
+                self._observed[key].copy_(value)
+            else:
+                self._observed[key][ids] = value.to(self._type(value))
         emitted = {key: value.clone() for key, value in self._observed.items()}
         emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
         if reward is not None:
