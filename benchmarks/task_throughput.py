@@ -9,8 +9,8 @@ and takes over the states in which ours begins new episodes, so that both comput
 random; in imitation they act by the policy that comes with the library, exploring as in training, so that episodes last
 as long as there. Its time is left out, for it is not the environment's.
 
-Both have one torch thread and all processors for physics, and take turns of some steps each, so that a busy machine slows
-both; a speed is the median over turns, the ratio the median of the turns'. ``physics`` is the share of our time inside
+Both have one torch thread and all processors for physics, and take turns of some steps each, so that a busy machine
+slows both; a speed is the median over turns, the ratio the median of the turns'. ``physics`` is the share of our time inside
 MuJoCo, ``resets`` the mean number of new episodes in a step. ``memory_kib`` is what one more simulation takes: resident
 memory of the process with the largest number of simulations less that without, divided by the number. Every pair has a
 process of its own.
@@ -185,6 +185,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one character, few simulations and turns")
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--characters", nargs="+", default=list(envs.characters.CHARACTERS))
+    parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), help="numbers of simulations")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads of the physics")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--job", help=argparse.SUPPRESS)
@@ -192,7 +193,7 @@ def main() -> None:
     if arguments.job:
         print(json.dumps(measure(*json.loads(arguments.job))))
         return
-    sizes, turns, steps = ([8], 2, 3) if arguments.quick else (list(SIZES), 6, 25)
+    sizes, turns, steps = ([8], 2, 3) if arguments.quick else (arguments.sizes, 6, 20)
     characters = arguments.characters[:1] if arguments.quick else arguments.characters
     conditions = {"turns": turns, "steps": steps, "threads": arguments.threads, **about(), "flags": instructions()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()))
