@@ -10,7 +10,7 @@ random; in imitation they act by the policy that comes with the library, explori
 as long as there. Its time is left out, for it is not the environment's.
 
 Both have one torch thread and all processors for physics, and take turns of some steps each, so that a busy machine
-slows both; a speed is the median over turns, the ratio the median of the turns'. ``physics`` is the share of our time inside
+slows both; a speed is the median over turns, the ratio that of the ratios. ``physics`` is the share of our time inside
 MuJoCo, ``resets`` the mean number of new episodes in a step. ``memory_kib`` is what one more simulation takes: resident
 memory of the process with the largest number of simulations less that without, divided by the number. Every pair has a
 process of its own.

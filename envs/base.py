@@ -17,9 +17,6 @@ from torchrl_mcp.envs.simulation import LARGEST, Simulation
 ALL = slice(None)
 """All simulations, as an index that takes no copy."""
 
-_IRREGULAR = frozenset({"next", "_step"})
-"""Entries by which the caller of a step prescribes its outcome, or who takes part."""
-
 
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
@@ -177,8 +174,8 @@ class CharacterEnv(EnvBase):
         The same as TorchRL's, but for what is known here: specs hold by construction, and what :meth:`_emit` tells
         after a partial reset is what is shown of all simulations, so that nothing needs merging.
         """
-        if tensordict.batch_size != self.batch_size or not _IRREGULAR.isdisjoint(tensordict.keys()):
-            return super().step_and_maybe_reset(tensordict)
+        if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:
+            return super().step_and_maybe_reset(tensordict)  # the caller prescribes the outcome, or who takes part
         outcome = self._step(tensordict)
         tensordict.set("next", outcome)
         state = self._step_mdp(tensordict)

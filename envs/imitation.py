@@ -252,8 +252,7 @@ class Imitation(PDCharacterEnv):
         clips, times = self._draw(len(each), self.episode["clip"][each] if self.switch_to == "same" else None)
         moments = self.library.at(clips, times)
         placement = placing(moments.qpos, self.simulation.state["qpos"][each])
-        candidates = moments.carried(placement).bodies
-        best = mismatch(self._body_states(each), candidates).view(-1, len(ids)).argmin(0)
+        best = mismatch(self._body_states(each), moments.carried(placement).bodies).view(-1, len(ids)).argmin(0)
         chosen = best * len(ids) + torch.arange(len(ids))
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
         for key, values in changed.items():

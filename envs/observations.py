@@ -64,9 +64,9 @@ def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
     \sin)`: of a vector (x, y) by :math:`\psi`, of a quaternion (w, z) and (x, y) by :math:`\psi / 2`.
     """
     positions, orientations, linear, angular = (_planes(field) for field in bodies)
-    origin = origin.numpy().reshape(-1, 3).T[None]
+    place = origin.numpy().reshape(1, -1, 3).swapaxes(1, 2)
     pairs = np.empty((5, 2, *positions[:, 0].shape), positions.dtype)
-    np.subtract(_pair(positions), _pair(origin), out=pairs[0])
+    np.subtract(_pair(positions), _pair(place), out=pairs[0])
     pairs[1], pairs[2] = _pair(linear), _pair(angular)
     pairs[3], pairs[4] = orientations[:, ::3].swapaxes(0, 1), orientations[:, 1:3].swapaxes(0, 1)
     turns = torch.from_numpy(angle.numpy().reshape(-1) * _TURNS)
@@ -78,7 +78,7 @@ def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
     seen = np.empty((len(positions), 13, positions.shape[-1]), positions.dtype)
     for pair, rows in zip(pairs, (slice(0, 2), slice(7, 9), slice(10, 12), slice(3, 7, 3), slice(4, 6)), strict=True):
         seen[:, rows] = pair.swapaxes(0, 1)
-    np.subtract(positions[:, 2], origin[:, 2], out=seen[:, 2])
+    np.subtract(positions[:, 2], place[:, 2], out=seen[:, 2])
     seen[:, 9], seen[:, 12] = linear[:, 2], angular[:, 2]
     return seen
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -17,6 +17,8 @@ from torchrl_mcp.envs.rotations import heading
 
 CONTROL_TIMESTEP = 1 / 30
 """Seconds per action."""
+
+Numbers = TypeVar("Numbers", Tensor, np.ndarray)
 
 
 class PDCharacterEnv(CharacterEnv):
@@ -207,7 +209,7 @@ def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int)
     return ids, half_sizes, radii
 
 
-def lowest_points(heights: Tensor, vertical: Tensor, half_sizes: Tensor, radii: Tensor) -> Tensor:
+def lowest_points(heights: Numbers, vertical: Numbers, half_sizes: Numbers, radii: Numbers) -> Numbers:
     r"""Height of the lowest point of spheres, capsules and boxes.
 
     .. math:: z - r - \sum_i |R_{3i}| h_i
