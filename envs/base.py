@@ -41,8 +41,8 @@ class CharacterEnv(EnvBase):
         persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         current: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         dtype: Type of what is emitted; physics and reward are computed in float64.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (TorchRL merges what a partial
-            reset emits into new tensors, which are not pinned.)
+        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
+            TorchRL merges what a partial reset emits into new tensors, which are not pinned.)
 
     Raises:
         ValueError: If an argument is out of range.
@@ -173,6 +173,22 @@ class CharacterEnv(EnvBase):
         drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
         self.generator.manual_seed(drawn)
 
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step all simulations and begin new episodes where they have ended; see ``EnvBase.step_and_maybe_reset``.
+
+        The same as TorchRL's, but for what is known here: specs hold by construction, and what :meth:`_emit` tells
+        after a partial reset is what is shown of all simulations, so that nothing needs merging.
+        """
+        if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:
+            return super().step_and_maybe_reset(tensordict)  # the caller prescribes the outcome, or who takes part
+        outcome = self._step(tensordict)
+        tensordict.set("next", outcome)
+        state = self._step_mdp(tensordict)
+        ended = outcome["done"].view(self.num_envs).nonzero().squeeze(-1)
+        if len(ended):
+            state.update(self._begin_episodes(ended, {}))
+        return tensordict, state
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["action"]
         expected = (self.num_envs, self.simulation.model.nu)
@@ -196,7 +212,10 @@ class CharacterEnv(EnvBase):
             snapshot, self._snapshot = self._snapshot, None
             return self._reset(snapshot, set_state=True)
         ids = torch.arange(self.num_envs) if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
-        state = self._checked(tensordict, ids) if set_state else {}
+        return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
+
+    def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
+        """Begin episodes in the simulations ``ids``; what their ``state`` does not say is drawn."""
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
             state = {**self._sample(len(ids)), **state}
@@ -226,7 +245,10 @@ class CharacterEnv(EnvBase):
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
         """What is told of all simulations, of which only ``ids`` have changed since the last time."""
         for key, value in self._observe(ids).items():
-            self._observed[key][ids] = value.to(self._type(value))
+            if isinstance(ids, slice):
+                self._observed[key].copy_(value)
+            else:
+                self._observed[key][ids] = value.to(self._type(value))
         emitted = {key: value.clone() for key, value in self._observed.items()}
         emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
         if reward is not None:

@@ -251,9 +251,9 @@ class Imitation(PDCharacterEnv):
             return
         each = ids.repeat(self.switch_candidates)
         clips, times = self._draw(len(each), self.episode["clip"][each] if self.switch_to == "same" else None)
-        placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][each])
-        references = self.library.at(clips, times, placement)
-        best = mismatch(self._body_states(each), references.bodies).view(-1, len(ids)).argmin(0)
+        moments = self.library.at(clips, times)
+        placement = placing(moments.qpos, self.simulation.state["qpos"][each])
+        best = mismatch(self._body_states(each), moments.carried(placement).bodies).view(-1, len(ids)).argmin(0)
         chosen = best * len(ids) + torch.arange(len(ids))
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
         for key, values in changed.items():

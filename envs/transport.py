@@ -94,6 +94,7 @@ class Transport(PDCharacterEnv):
         rows, outputs = slice(1 + len(self._bodies), None), self.simulation.outputs
         angular, linear = outputs["cvel"][:, rows].split(3, -1)
         self._things = BodyStates(outputs["xpos"][:, rows], outputs["xquat"][:, rows], linear, angular)
+        self._look_at(slice(1, None))  # seen together, they take little longer than the character alone
         self._target, self._object = self._things.positions[:, 0], self._things.positions[:, -1]
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
@@ -140,11 +141,6 @@ class Transport(PDCharacterEnv):
             "goal": torch.cat(shown, -1),
             "success": self.success()[ids].unsqueeze(-1),
         }
-
-    def _body_states(self, ids: Tensor | slice) -> BodyStates:
-        """The character's bodies and the things: seen together, they take little longer than the character alone."""
-        things = (part[ids].to(self._dtype) for part in self._things)
-        return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(ids), things, strict=True)))
 
     def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
