@@ -10,13 +10,18 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+VECTOR_FLAGS = ("avx2", "fma", "avx512f", "avx512_bf16", "avx512_fp16", "avx_vnni", "amx")
+"""Beginnings of the processor's flags that decide how fast a matrix product is."""
+
 
 def about() -> dict[str, str | int]:
     """Return what the numbers were measured on, with what, and when."""
-    cpu = platform.processor()
-    with suppress(OSError, StopIteration):
+    cpu, flags = platform.processor(), []
+    with suppress(OSError, KeyError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+        described = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+        cpu = described["model name"]
+        flags = [flag for flag in described["flags"].split() if flag.startswith(VECTOR_FLAGS)]
     commit = ""
     with suppress(OSError):
         command = ["git", "rev-parse", "--short", "HEAD"]
@@ -31,6 +36,7 @@ def about() -> dict[str, str | int]:
         "commit": commit,
         "date": date.today().isoformat(),
         "cpu": cpu,
+        "flags": " ".join(flags),
         "cores": os.cpu_count() or 1,
         "python": platform.python_version(),
         **versions,

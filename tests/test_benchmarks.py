@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-ABOUT = {"commit", "date", "cpu", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
+ABOUT = {"commit", "date", "cpu", "flags", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
 
 
 def run(script, output, *arguments):
