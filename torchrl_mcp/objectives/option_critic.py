@@ -190,16 +190,18 @@ class OptionCriticLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the terms of the loss, and what they say of the update, as scalars."""
-        terms = {} if self.critic_network is None else {"loss_critic": self._critic_loss(tensordict)}
+        terms = self._critic_losses(tensordict)
         if self._learns_options():
             terms |= self._option_losses(tensordict)
         return TensorDict(terms)
 
-    def _critic_loss(self, tensordict: TensorDictBase) -> Tensor:
+    def _critic_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        if self.critic_network is None:
+            return {}
         keys = self.tensor_keys
         values = self.critic_network(tensordict.select(*self.critic_network.in_keys))[keys.option_values]
         error = of_option(values, tensordict[keys.option]) - tensordict[keys.value_target]
-        return error.square().mean() / 2
+        return {"loss_critic": error.square().mean() / 2}
 
     def _option_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         keys = self.tensor_keys
