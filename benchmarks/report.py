@@ -27,16 +27,6 @@ def about() -> dict[str, Any]:
     return {"commit": commit(here) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
 
 
-def instructions() -> str:
-    """Return the sets of instructions of this processor that matter to tensors, as Linux names them."""
-    wide = ("avx2", "fma", "avx512f", "avx512_bf16", "amx_bf16")
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        flags = next(line.split(":")[1].split() for line in lines if line.startswith("flags"))
-        return " ".join(flag for flag in wide if flag in flags)
-    return ""
-
-
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows of one set of keys as text, a line each."""
     from torchrl_mcp.runs.tables import text_table

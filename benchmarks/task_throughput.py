@@ -35,7 +35,7 @@ import torch
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from mujoco.batch import Batch
-from report import about, instructions, table, write
+from report import about, table, write
 from tensordict import TensorDictBase
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -195,7 +195,7 @@ def main() -> None:
         return
     sizes, turns, steps = ([8], 2, 3) if arguments.quick else (arguments.sizes, 6, 20)
     characters = arguments.characters[:1] if arguments.quick else arguments.characters
-    conditions = {"turns": turns, "steps": steps, "threads": arguments.threads, **about(), "flags": instructions()}
+    conditions = {"turns": turns, "steps": steps, "threads": arguments.threads, **about()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()))
     measured = list(rows(arguments.tasks, characters, sizes, turns, steps, arguments.threads))
     print(table(measured))

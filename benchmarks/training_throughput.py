@@ -10,6 +10,8 @@ initial policy's spread, frames per iteration, minibatch and epochs (those of pr
 of threads. The rest is what each does by default: ours sees a goal, standardises its inputs and takes fused Adam steps.
 
 A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` measures others than the default.
+With ``--before PYTHON``, an interpreter that has another version of this library, ``before-METHOD-PRECISION`` is that
+version, side by side with this one.
 Each has a process of its own, in which the first iteration is not counted. They then take turns, one iteration each per
 round, while the others wait, so that a busy machine slows all of them. A speed is the median over rounds, a ratio the
 median of the rounds'.
@@ -153,7 +155,7 @@ def worker(name: str, training: dict[str, int], threads: int) -> None:
 
     torch.set_num_threads(threads)
     family, kind, detail = name.split("-")
-    {"ours": ours, "sb3": sb3}[family](kind, detail, training)
+    {"ours": ours, "before": ours, "sb3": sb3}[family](kind, detail, training)
 
 
 def peak_memory(pid: int) -> float:
@@ -181,14 +183,17 @@ def iterate(name: str, process: subprocess.Popen) -> Iteration:
     raise SystemExit(f"{name} failed, see above")
 
 
-def measure(contenders: list[str], training: dict[str, int], threads: int, rounds: int) -> dict[str, list[Iteration]]:
-    """Return every contender's iterations, one per round."""
+def measure(
+    contenders: list[str], training: dict[str, int], threads: int, rounds: int, before: str
+) -> dict[str, list[Iteration]]:
+    """Return every contender's iterations, one per round; ``before`` is the interpreter of those of that name."""
     processes: dict[str, subprocess.Popen] = {}
     pipe, settings = subprocess.PIPE, ["--threads", str(threads), "--worker", json.dumps(training)]
     with TemporaryDirectory() as folder:
         try:
             for name in contenders:
-                command, home = [sys.executable, str(SCRIPT), *settings, name], Path(folder, name)
+                python = before if name.startswith("before") else sys.executable
+                command, home = [python, str(SCRIPT), *settings, name], Path(folder, name)
                 home.mkdir()
                 processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=home)
                 iterate(name, processes[name])
@@ -239,6 +244,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small batches, fewer contenders and rounds")
     parser.add_argument("--contenders", nargs="+", metavar="NAME")
+    parser.add_argument(
+        "--before", default=sys.executable, metavar="PYTHON", help="interpreter of before-... contenders"
+    )
+    parser.add_argument("--rounds", type=int, help="iterations of every contender")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads of every contender")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--worker", nargs=2, help=argparse.SUPPRESS)
@@ -252,10 +261,10 @@ def main() -> None:
     contenders = available(args.contenders or (QUICK_CONTENDERS if args.quick else CONTENDERS))
     if not contenders:
         return
-    rounds = 2 if args.quick else 10
+    rounds = args.rounds or (2 if args.quick else 10)
     conditions = {**training, "step_size": STEP_SIZE, "threads": args.threads, "rounds": rounds, **about()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()), flush=True)
-    rows = summaries(measure(contenders, training, args.threads, rounds), training["frames_per_batch"])
+    rows = summaries(measure(contenders, training, args.threads, rounds, args.before), training["frames_per_batch"])
     print(table(rows))
     for row in rows:
         if row["contender"].startswith("ours-scratch") and row["of_best_sb3"]:

@@ -74,6 +74,7 @@ def option_critic_parts(
                 out_features=num_options,
                 num_cells=list(values_cells),
                 activation_class=nn.ReLU,
+                activation_kwargs={"inplace": True},
             ),
         }
     )

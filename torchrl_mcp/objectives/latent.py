@@ -24,7 +24,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
 
     Args:
         actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
-        critic_network: The value function.
+        critic_network: The value function, or None where it learns by a loss of its own.
         kl_coeff: Weight of the penalty, :math:`\beta`.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
 
@@ -35,7 +35,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
+        critic_network: TensorDictModuleBase | None,
         *,
         kl_coeff: float,
         **kwargs: Any,

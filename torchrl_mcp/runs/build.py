@@ -150,7 +150,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         "critic": list(agent.parts["critic"].parameters()),
     }
     optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
-    loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
+    loss = instantiate(cfg.objective.loss)(agent.actor.trained, None)
     loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
     training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
     training["frames_per_batch"] *= cfg.get("batch_factor", 1)
@@ -159,7 +159,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         parts=agent.parts,
         actor=agent.actor,
         critic=agent.critic,
-        loss=loss,
+        losses={"actor": loss, "critic": instantiate(cfg.objective.value_loss)(agent.critic)},
         advantages=instantiate(cfg.objective.advantages)(agent.critic),
         optimizers=optimizers,
         frozen=agent.frozen,

@@ -1,7 +1,6 @@
 """Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -16,6 +15,7 @@ from torchrl.collectors import Collector
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training.progress import Stopwatch
+from torchrl_mcp.training.threads import threads
 
 Environments = CharacterEnv | TransformedCharacterEnv
 
@@ -113,7 +113,9 @@ class LocalSource:
     def collect(self) -> TensorDictBase:
         """Return the next trajectories; the time goes to ``physics`` and ``forward``."""
         before = self.env.physics_seconds
-        with self._precision(), _one_thread():
+        # OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step
+        # takes: torch keeps to this thread, and the processors are left to physics.
+        with self._precision(), threads(1):
             batch = next(self._batches)
         self._stopwatch.add("physics", self.env.physics_seconds - before)
         return batch
@@ -254,17 +256,3 @@ def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **setting
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     return make_env(seed=seed, **settings)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to the calling thread, and the processors to physics.
-
-    OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step takes.
-    """
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)
