@@ -33,7 +33,8 @@ from torchrl_mcp.training.run_folder import CONFIG, LOG
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
-TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "pretrained", "transfer.freeze", "transfer.keep"}
+TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "practice", "pretrained", "transfer.freeze",
+                 "transfer.keep"}  # fmt: skip
 """Settings that make no difference to pre-training, or that it refuses."""
 INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
                "progress_bar", "resume", "torch_threads"}  # fmt: skip
