@@ -44,7 +44,8 @@ class Ranges:
 
     def draw(self, num: int, generator: torch.Generator) -> dict[str, Tensor]:
         """Draw for ``num`` episodes: by name, ``(num,)``, float64."""
-        chosen = torch.multinomial(self._weights, num, replacement=True, generator=generator) if num else []
+        draws = max(num, 1)  # multinomial draws no empty sample
+        chosen = torch.multinomial(self._weights, draws, replacement=True, generator=generator)[:num]
         low, high = self._bounds[chosen].unbind(-1)
         drawn = low + (high - low) * torch.rand(low.shape, dtype=torch.float64, generator=generator)
         return dict(zip(self._names, drawn.unbind(-1), strict=True))
