@@ -1,7 +1,6 @@
 """Potential-based shaping: rewards for progress that leave the best policy what it was."""
 
 from collections.abc import Mapping
-
 from typing import NamedTuple
 
 import torch

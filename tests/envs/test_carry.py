@@ -215,6 +215,11 @@ def test_success_is_a_box_that_was_taken_and_put_down_on_the_target():
     assert not env.reset(above, set_state=True)["success"].any()
 
 
+def test_no_episode_begins_with_a_success():
+    env = make(500, object_distances=(0.5, 1.0), target_distances=(0.0, 0.5))
+    assert not env.reset()["success"].any()
+
+
 def test_tables_hold_the_box_and_touch_no_character():
     model = make(1, "humanoid", self_collision=True).simulation.model
     tops = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name in ("source", "target")]
