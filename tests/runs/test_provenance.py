@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from torchrl_mcp import __version__
 from torchrl_mcp.runs import provenance
+from torchrl_mcp.training.precision import Precision
 
 
 def git(folder, *arguments):
@@ -49,8 +50,9 @@ def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tm
 
 def test_the_origin_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
-    content = json.loads(json.dumps(provenance.origin("cpu")))
+    content = json.loads(json.dumps(provenance.origin("cpu", Precision(True, "as measured"))))
     assert content["command"] == ["script.py", "seed=3"]
+    assert content["precision"] == "networks in bfloat16: as measured"
     assert content["version"] == __version__
     assert abs((datetime.now(UTC) - datetime.fromisoformat(content["started"])).total_seconds()) < 60
     assert content["machine"]["torch"] == torch.__version__
@@ -68,6 +70,6 @@ def test_within_hydra_command_and_choices_are_those_of_the_job(monkeypatch):
     )
     monkeypatch.setattr(provenance.HydraConfig, "initialized", lambda: True)
     monkeypatch.setattr(provenance.HydraConfig, "get", lambda: hydra)
-    content = json.loads(json.dumps(provenance.origin("cpu")))
+    content = json.loads(json.dumps(provenance.origin("cpu", Precision(False, "autocast=false"))))
     assert content["command"] == ["torchrl-mcp-train", "preset=fast", "seed=1"]
     assert content["choices"] == {"preset": "fast"}

@@ -110,8 +110,12 @@ def configuration(folder: Path, overrides: Sequence[str]) -> DictConfig:
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         cfg = compose("train", list(overrides))
     cfg.run_dir = str(folder)
-    saved = folder / CONFIG
-    if saved.exists() and _settings(OmegaConf.load(saved)) != _settings(cfg):
+    if not (folder / CONFIG).exists():
+        return cfg
+    held = OmegaConf.load(folder / CONFIG)
+    if cfg.autocast == "auto":
+        cfg.autocast = held.autocast  # what the run found best
+    if _settings(held) != _settings(cfg):
         raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
     return cfg
 

@@ -38,6 +38,8 @@ TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "pretrained
 INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
                "progress_bar", "resume", "torch_threads"}  # fmt: skip
 """Settings that may differ from those that a run began with."""
+LEFT_OPEN = {"autocast": "auto"}
+"""Values that leave a setting to the machine, so that any value agrees with them."""
 
 Settings = Mapping[str, str]
 
@@ -200,8 +202,9 @@ def conflict(job: Job) -> str | None:
 
 def differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
     """Return the settings that make two runs differ."""
+    indifferent = INDIFFERENT | {key for key, value in LEFT_OPEN.items() if wanted.get(key) == value}
     keys = dict.fromkeys([*held, *wanted])
-    return [key for key in keys if key not in INDIFFERENT and held.get(key) != wanted.get(key)]
+    return [key for key in keys if key not in indifferent and held.get(key) != wanted.get(key)]
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:

@@ -22,7 +22,8 @@ from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation.rollout import evaluate, summary
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs.provenance import origin
+from torchrl_mcp.runs.provenance import machine, origin
+from torchrl_mcp.training.precision import Precision, choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
 from torchrl_mcp.training.trainer import Trainer
 
@@ -33,16 +34,21 @@ USUAL = ("collector", "evaluation")
 def train(cfg: DictConfig) -> Path:
     """Train from the start in the run folder ``cfg.run_dir``, evaluate the policy, and return the folder.
 
+    The folder's configuration holds the precision that was chosen, where ``cfg.autocast`` leaves it to the machine.
+
     Raises:
         ValueError: If the folder holds a run already, or the configuration lacks the checkpoint to transfer from.
     """
     folder = Path(cfg.run_dir)
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
-    trainer = _trainer(cfg, folder, _pretrained(cfg))
+    pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
+    print(f"{folder}: {precision}", flush=True)
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
+    trainer = _trainer(cfg, folder, pretrained)
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
-    _write(origin(cfg.device), folder / ORIGIN)
+    _write(origin(cfg.device, precision), folder / ORIGIN)
     # Last, because it is what says that there is a run to resume.
     OmegaConf.save(cfg, folder / CONFIG, resolve=True)
     _finish(trainer, cfg, folder)
@@ -52,7 +58,7 @@ def train(cfg: DictConfig) -> Path:
 def resume(folder: Path) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with the configuration it began with.
 
-    A run that :func:`is_complete` is left as it is.
+    A run that :func:`is_complete` is left as it is. On another machine it keeps the precision that it began with.
 
     Raises:
         ValueError: If the folder holds no run, or its checkpoint is damaged.
@@ -60,6 +66,7 @@ def resume(folder: Path) -> Path:
     if is_complete(folder):
         return folder
     cfg, newest = configuration(folder), checkpoint.find(folder)
+    print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
     if checkpoint.frames(newest):
         trainer = _trainer(cfg, folder)
         trainer.restore(newest)
@@ -210,6 +217,19 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
     source = make_source(cfg)
     agent = make_agent(cfg, source.env, pretrained)
     return make_trainer(cfg, agent, source, folder)
+
+
+def _precision_kept(cfg: DictConfig, folder: Path) -> str:
+    """Return in which precision a run goes on, and whether it began on another machine."""
+    precision = name(choose(cfg.autocast, cfg.device).autocast)
+    began = json.loads((folder / ORIGIN).read_text())["machine"] if (folder / ORIGIN).is_file() else {}
+    now = machine(cfg.device)
+    if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
+        return f"goes on with networks in {precision}"
+    return (
+        f"began on {began['processor']} ({began['device']}) and goes on on {now['processor']} ({now['device']}), with "
+        f"networks in {precision} as it began"
+    )
 
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:

@@ -14,17 +14,23 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 
 from torchrl_mcp import __version__
+from torchrl_mcp.training.precision import Precision
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def origin(device: str) -> dict[str, Any]:
+def origin(device: str, precision: Precision) -> dict[str, Any]:
     """Return what a run on ``device`` should remember of its beginning, JSON-compatible.
+
+    Args:
+        device: Where its networks are.
+        precision: What they compute in.
 
     Returns:
         ``command`` as a list of words; ``commit`` of the library, with ``-dirty`` where files were changed since, or
         None where it is no checkout; its ``version``; ``choices``, the choice of each group of the configuration,
-        where Hydra runs; ``started``, an ISO time; and the ``machine``.
+        where Hydra runs; ``precision`` of the networks and the reason for it; ``started``, an ISO time; and the
+        ``machine``.
     """
     command, choices = list(sys.argv), {}
     if HydraConfig.initialized():
@@ -37,6 +43,7 @@ def origin(device: str) -> dict[str, Any]:
         "commit": commit(PACKAGE),
         "version": __version__,
         "choices": choices,
+        "precision": str(precision),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(device),
     }
