@@ -109,10 +109,13 @@ def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
     """
     cfg = build.compose_run(*overrides)
     cfg.run_dir = str(folder)
-    if (folder / CONFIG).exists():
-        held, wanted = (OmegaConf.to_container(one, resolve=True) for one in (experiment.run_config(folder), cfg))
-        if differences(cast("dict", held), cast("dict", wanted), PLACES):
-            raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
+    if not (folder / CONFIG).exists():
+        return cfg
+    held = experiment.run_config(folder)
+    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, cfg))
+    if differences(began, begins, PLACES):
+        raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
+    cfg.autocast = held.autocast  # the precision that the run chose
     return cfg
 
 
