@@ -23,7 +23,7 @@ from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation.rollout import evaluate, summary
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs.provenance import machine, origin
-from torchrl_mcp.training.precision import Precision, choose, name
+from torchrl_mcp.training.precision import choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
 from torchrl_mcp.training.trainer import Trainer
 
