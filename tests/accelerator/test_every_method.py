@@ -28,16 +28,16 @@ def rehearsal(request):
     command = [sys.executable, "-W", "ignore", str(REHEARSAL), request.param]
     run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout, parse_constant=str)  # NaN where no episode has ended
+    found = json.loads(run.stdout)
     return request.param, found[request.param], found["planted"]
 
 
 def test_a_method_learns_what_it_learns_on_the_cpu_and_resumes_to_the_same_numbers(rehearsal):
     method, found, _ = rehearsal
     if method != "scratch":
-        assert found["pretrain"] == [pytest.approx(row, rel=1e-3, abs=1e-6) for row in found["cpu"]]
+        assert found["pretrain"] == [pytest.approx(row, rel=1e-3, abs=1e-6, nan_ok=True) for row in found["cpu"]]
     assert len(found["transfer"]) == 2
-    assert found["resumed"] == found["transfer"]
+    assert str(found["resumed"]) == str(found["transfer"])  # NaN where no episode has ended
     for numbers in found["evaluation"].values():
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
 
