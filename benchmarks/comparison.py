@@ -20,7 +20,7 @@ from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curv
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import Cell, cells
 from torchrl_mcp.report.results import MODES, Run, find_runs
-from torchrl_mcp.report.sections import method_title
+from torchrl_mcp.runs.tables import text_table
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
@@ -59,14 +59,13 @@ def main() -> None:
     curves = learning_curves({title(cell, usual): [run.path for run in cell.complete] for cell in drawn})
     write_curves(curves, stem.with_name(f"{stem.name}_curves.csv"))
     save_figure(draw_curves(curves), stem.with_name(f"{stem.name}_curves"))
-    for cell, name in zip(found, titles, strict=True):
-        print(line(cell, name))
+    print(text_table([line(cell, name) for cell, name in zip(found, titles, strict=True)], markdown=True))
 
 
 def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
     """Return the facts of a run and its numbers in a mode."""
     numbers, before = run.evaluation[mode], run.settings.get("pretrained")
-    machine, command = run.origin.get("machine", {}), run.origin.get("command", [])
+    machine, command = run.provenance.get("machine", {}), run.provenance.get("command", [])
     return {
         "method": name,
         "seed": run.seed,
@@ -74,7 +73,7 @@ def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> d
         "steps": run.frames,
         "mode": mode,
         **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
-        **{key: value for key, value in numbers["measures"].items() if not key.startswith("reward_")},
+        **{key: value for key, value in numbers["metrics"].items() if not key.startswith("reward_")},
         "episodes": numbers["episodes"],
         "paper": paper(cell),
         "seconds": round(run.seconds),
@@ -85,23 +84,29 @@ def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> d
     }
 
 
-def line(cell: Cell, name: str) -> str:
-    """Return a row of a table in Markdown."""
-    numbers = []
+def line(cell: Cell, name: str) -> dict[str, Any]:
+    """Return a row of the printed table: means and standard deviations over seeds."""
+    scores = {}
     for mode in MODES:
         spread = f" +- {cell.deviation(mode):.3f}" if len(cell.complete) > 1 else ""
-        numbers.append(f"{sum(cell.returns(mode)) / len(cell.complete):.3f}{spread}")
+        scores[mode] = f"{sum(cell.returns(mode)) / len(cell.complete):.3f}{spread}"
     fallen = [run.evaluation["deterministic"]["terminated"] for run in cell.complete]
-    numbers.insert(1, f"{sum(fallen) / len(fallen):.0%}")
-    return f"| {name} | {len(cell.complete)} | {' | '.join(numbers)} | {paper(cell)} |"
+    return {
+        "method": name,
+        "seeds": len(cell.complete),
+        "deterministic": scores["deterministic"],
+        "fallen": f"{sum(fallen) / len(fallen):.0%}",
+        "stochastic": scores["stochastic"],
+        "paper": paper(cell),
+    }
 
 
 def title(cell: Cell, usual: int | None) -> str:
     """Return the name of a method, and what it transfers from if that is not the usual pre-training."""
     if cell.choices["pretrained"]:
-        return f"{method_title(cell.method)}, built in"
+        return f"{cell.title}, built in"
     steps = budget(cell)
-    return method_title(cell.method) + (f", {steps / 1e6:g} M" if steps and steps != usual else "")
+    return cell.title + (f", {steps / 1e6:g} M" if steps and steps != usual else "")
 
 
 def budget(cell: Cell) -> int | None:

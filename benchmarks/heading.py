@@ -10,16 +10,14 @@ Every character learns with ``method=scratch task=heading preset=fast character.
 """
 
 import argparse
-import csv
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import torch
+from report import about, table, write
 
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
@@ -73,33 +71,25 @@ def has_ended(run: Path, steps: int) -> bool:
 def report(runs: dict[str, Path], episodes: int) -> None:
     """Write table, curves and films of runs that have ended to ``benchmarks/results``."""
     rows = [row for character, run in runs.items() for row in evaluate(character, run, episodes)]
-    with (RESULTS / "heading.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write(RESULTS / "heading.csv", rows)
     curves = learning_curves({character: [run] for character, run in runs.items()})
     write_curves(curves, RESULTS / "heading_curves.csv")
     save_figure(draw_curves(curves), RESULTS / "heading_curves")
     for character, run in runs.items():
         _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
         save_film(agent.actor.policy, env, RESULTS / f"heading_{character}.gif")
-    for row in rows:
-        print(
-            f"{row['character']} {row['mode']}: {row['normalised_return']:.3f} +- {row['normalised_return_std']:.3f}, "
-            f"fallen {row['terminated']:.0%}, paper {row['paper']}"
-        )
+    shown = ("character", "mode", "normalised_return", "normalised_return_std", "terminated", "paper")
+    print(table([{key: row[key] for key in shown} for row in rows]))
 
 
 def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
     """Yield the numbers of a run, deterministic and stochastic."""
     last = read_metrics(run)[-1]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
     facts = {"character": character, "method": "scratch", "seed": 0, "preset": "fast", "paper": PAPER[character]}
     cost = {"frames": int(last["frames"]), "training_seconds": round(last["seconds"])}
-    machine = {"torch": torch.__version__, "machine": platform.machine(), "evaluated_at": commit.stdout.strip()}
     for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
-        del numbers["measures"], numbers["diagnostics"]
-        yield facts | cost | {"mode": mode} | numbers | machine
+        del numbers["metrics"], numbers["diagnostics"]
+        yield facts | cost | {"mode": mode} | numbers | about()
 
 
 if __name__ == "__main__":

@@ -8,10 +8,8 @@ pre-training and transfer take together. Every run is one of ``torchrl-mcp-train
 """
 
 import argparse
-import csv
 import math
 import os
-import platform
 import shlex
 import statistics
 import subprocess
@@ -21,12 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from report import write
 
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
 from torchrl_mcp.report.results import Run, read_run
 from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import CONFIG
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -129,10 +129,7 @@ def report(folder: Path, seeds: list[int], episodes: int) -> None:
     """Evaluate every run that has ended and write table, curves and figures to ``benchmarks/results``."""
     ended = {name: [s for s in seeds if has_ended(folder / f"{name}-{s}", c.steps)] for name, c in CONTENDERS.items()}
     rows = [row for name in CONTENDERS for seed in ended[name] for row in evaluate(folder, name, seed, episodes)]
-    with (RESULTS / "holdout.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write(RESULTS / "holdout.csv", rows)
     groups = {c.label: [folder / f"{name}-{s}" for s in ended[name]] for name, c in CONTENDERS.items() if ended[name]}
     curves = learning_curves(groups)
     write_curves(curves, RESULTS / "holdout_curves.csv")
@@ -164,7 +161,7 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
         raise ValueError(f"{path} {run.reason}")
     numbers = experiment.evaluate_run(path, episodes=episodes, seed=12345)
     for values in numbers.values():
-        del values["measures"], values["diagnostics"]
+        del values["metrics"], values["diagnostics"]
     facts = {
         "contender": name,
         "label": contender.label,
@@ -176,25 +173,24 @@ def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
     source = {
         "seconds": round(run.seconds),
         "commit": run.commit,
-        "torch": torch.__version__,
-        "machine": platform.machine(),
-        "command": shlex.join(run.origin.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
+        **run.provenance.get("machine", {}),
+        "command": shlex.join(run.provenance.get("command", [])).replace(str(folder.resolve()), "runs/holdout"),
     }
     return [facts | {"mode": mode, "paper": contender.paper} | values | source for mode, values in numbers.items()]
 
 
 def table(rows: list[dict]) -> str:
     """Return the results as Markdown: mean and standard deviation over seeds."""
-    lines = ["| | steps | seeds | deterministic | stochastic | paper |", "|---|---|---|---|---|---|"]
+    lines = []
     for name, contender in CONTENDERS.items():
         scores = {
             mode: [row["normalised_return"] for row in rows if (row["contender"], row["mode"]) == (name, mode)]
             for mode in ("deterministic", "stochastic")
         }
-        cells = [spread(values) for values in scores.values()]
-        seeds = len(scores["deterministic"])
-        lines.append(f"| {contender.label} | {contender.steps:,} | {seeds} | {' | '.join(cells)} | {contender.paper} |")
-    return "\n".join(lines)
+        facts = {"": contender.label, "steps": f"{contender.steps:,}", "seeds": len(scores["deterministic"])}
+        means = {mode: spread(values) for mode, values in scores.items()}
+        lines.append(facts | means | {"paper": contender.paper})
+    return text_table(lines, markdown=True)
 
 
 def spread(values: list[float]) -> str:

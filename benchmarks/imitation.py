@@ -7,9 +7,7 @@ stopped. It writes learning curves, returns with changing references, the tracki
 """
 
 import argparse
-import csv
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -18,13 +16,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 from omegaconf import OmegaConf
+from report import about, write
 
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import FOLDER
 from torchrl_mcp.training import checkpoint
-from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.training.run_folder import CONFIG, replacing
 from torchrl_mcp.viewer.film import save_film
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -82,7 +81,7 @@ def train(run: Path, character: str) -> None:
             set_phase(run, steps, settings)
             arguments = [f"resume={run}"]
         else:
-            phase = [f"imitation.{name}={value}" for name, value in settings.items()]
+            phase = [f"+imitation.{name}={value}" for name, value in settings.items()]
             facts = [f"character={character}", f"training.total_frames={steps}", f"run_dir={run}"]
             arguments = [*COMMON, *MACHINE, *facts, *phase]
         command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]
@@ -95,7 +94,8 @@ def set_phase(run: Path, steps: int, settings: Mapping[str, float]) -> None:
     cfg.training.total_frames = steps
     cfg.imitation.update(settings)
     cfg.task.pretrain.update(settings)
-    OmegaConf.save(cfg, run / CONFIG)
+    with replacing(run / CONFIG) as partial:
+        OmegaConf.save(cfg, partial)
 
 
 def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None:
@@ -105,13 +105,13 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     for character, run in runs.items():
         for changes, candidates in CHANGES.items():
             for mode, numbers in evaluate(run, episodes, candidates).items():
-                about = {"character": character, "changes": changes, "mode": mode}
-                rows.append(about | facts[character] | numbers | {"machine": platform.machine()})
-                print(*about.values(), f"{numbers['completed']:.0%}, {numbers['tracking_error']:.3f} m", flush=True)
+                case = {"character": character, "changes": changes, "mode": mode}
+                rows.append(case | facts[character] | numbers | about())
+                print(*case.values(), f"{numbers['completed']:.0%}, {numbers['tracking_error']:.3f} m", flush=True)
         followed = experiment.evaluate_clips(run, episodes=episodes_per_clip, seed=EVALUATION_SEED)
         clips += [{"character": character, **asdict(clip)} for clip in followed]
-    write_table(rows, RESULTS / "imitation.csv")
-    write_table(clips, RESULTS / "imitation_clips.csv")
+    write(RESULTS / "imitation.csv", rows)
+    write(RESULTS / "imitation_clips.csv", clips)
     curves = learning_curves({character: [run] for character, run in runs.items()}, quantity="episode/length")
     write_curves(curves, RESULTS / "imitation_curves.csv")
     save_figure(draw_curves(curves, ylabel="control steps per episode"), RESULTS / "imitation_curves")
@@ -127,7 +127,7 @@ def evaluate(run: Path, episodes: int, candidates: int) -> dict[str, dict[str, f
     evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **changing)
     for numbers in evaluation.values():
         numbers["completed"] = 1 - numbers.pop("terminated")
-        numbers["tracking_error"] = numbers.pop("measures")["tracking_error"]
+        numbers["tracking_error"] = numbers.pop("metrics")["tracking_error"]
         del numbers["diagnostics"]
     return evaluation
 
@@ -137,14 +137,6 @@ def cost(run: Path) -> dict[str, float]:
     frames = int(checkpoint.find(run).stem.partition("-")[2])
     seconds = next(row["seconds"] for row in read_metrics(run) if row["frames"] == frames)
     return {"frames": frames, "training_seconds": round(seconds), "steps_per_second": round(frames / seconds)}
-
-
-def write_table(rows: list[dict], path: Path) -> None:
-    """Write rows of equal keys as CSV."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

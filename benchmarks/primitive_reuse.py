@@ -25,7 +25,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from report import about, table, write
 from tensordict import TensorDict, TensorDictBase
-from training_throughput import configuration
 
 from torchrl_mcp.runs import build
 from torchrl_mcp.training.collectors import LocalSource
@@ -88,7 +87,7 @@ def compare(character: str, precision: str, training: dict[str, int], repeats: i
     """Return the row of a character and a precision."""
     sizes = CHARACTERS[character]
     overrides = [f"training.{key}={value}" for key, value in training.items()]
-    cfg = configuration("method=mcp", "stage=transfer", f"autocast={precision == 'bf16'}", "run_dir=.", *overrides)
+    cfg = build.compose_run("method=mcp", "stage=transfer", f"autocast={precision == 'bf16'}", "run_dir=.", *overrides)
     with TemporaryDirectory() as folder:
         trainers = {
             name: make_trainer(cfg, sizes, Path(folder), reuse=name == "reuse") for name in ("reuse", "no_reuse")
@@ -125,7 +124,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     repeats = 2 if args.quick else 10
-    preset = configuration("preset=fast").training
+    preset = build.compose_run("preset=fast").training
     training = QUICK_TRAINING if args.quick else {key: preset[key] for key in QUICK_TRAINING}
     conditions = {**training, "threads": args.threads, "repeats": repeats, **about()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()), flush=True)

@@ -1,47 +1,37 @@
-"""What benchmarks report: rows as text and as CSV, and what they were measured on."""
+"""What benchmarks report: rows as text and as CSV, and what they were measured on.
+
+The library is imported where it is needed, because benchmarks also run contenders in interpreters that lack it.
+"""
 
 import csv
 import importlib.metadata
-import os
-import platform
-import subprocess
 from contextlib import suppress
 from datetime import date
 from pathlib import Path
 from typing import Any
 
+PACKAGES = ("tensordict", "gymnasium", "numpy", "stable-baselines3")
+"""Their versions are reported beside those of the machine's description."""
 
-def about() -> dict[str, str | int]:
-    """Return what the numbers were measured on, with what, and when."""
-    cpu = platform.processor()
-    with suppress(OSError, StopIteration):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    commit = ""
-    with suppress(OSError):
-        command = ["git", "rev-parse", "--short", "HEAD"]
-        folder = Path(__file__).resolve().parent
-        commit = subprocess.run(command, capture_output=True, text=True, cwd=folder).stdout.strip()
-    packages = ["torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy", "stable-baselines3"]
+
+def about() -> dict[str, Any]:
+    """Return commit, date, the description of the machine, and the versions of what is installed."""
+    from torchrl_mcp.runs.machine import machine
+    from torchrl_mcp.runs.provenance import commit
+
     versions = {}
-    for package in packages:
+    for package in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-    return {
-        "commit": commit,
-        "date": date.today().isoformat(),
-        "cpu": cpu,
-        "cores": os.cpu_count() or 1,
-        "python": platform.python_version(),
-        **versions,
-    }
+    here = Path(__file__).resolve().parent
+    return {"commit": commit(here) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows of one set of keys as text, a line each."""
-    lines = [list(rows[0]), *([str(value) if value != "" else "-" for value in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+    from torchrl_mcp.runs.tables import text_table
+
+    return text_table(rows)
 
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:

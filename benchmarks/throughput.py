@@ -29,7 +29,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from report import about, write
+from report import about, table, write
 
 RESULTS = Path(__file__).parent / "results" / "throughput_env.csv"
 SUBSTEPS = 5
@@ -232,7 +232,7 @@ def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
         **{key: row[key] for key in ("turn", "contender", "num_envs")},
         "steps_per_second": round(median(row["speeds"])),
         "best": round(max(row["speeds"])),
-        "of_limit": f"{row['of_limit']:.3f}",
+        "of_limit": round(row["of_limit"], 3),
         "memory_mib": round(row["memory"]),
         "rounds": len(row["speeds"]),
         **facts,
@@ -253,18 +253,13 @@ def main() -> None:
     rounds, seconds = (3, 0.7) if args.quick else (5, 1.0)
     facts, rows = about(), []
     print(" | ".join(f"{key} {value}" for key, value in facts.items()))
-    print(f"{'contender':28} {'envs':>5} {'steps/s':>9} {'best':>9} {'of limit':>9} {'memory MiB':>11}")
     for turn in (1, 2) if args.quick else range(len(SIZES)):
         sizes = {name: counts[turn] for name, (_, counts) in CONTENDERS.items()}
         new = list(measure(sizes, args.envpool_python, rounds, seconds))
         limit = next(row for row in new if row["contender"] == "mujoco.batch")
         for row in new:
             row["turn"], row["of_limit"] = SIZES[turn], ratio(row, limit)
-            print(
-                f"{row['contender']:28} {row['num_envs']:5} {median(row['speeds']):9.0f} {max(row['speeds']):9.0f} "
-                f"{row['of_limit']:9.3f} {row['memory']:11.0f}",
-                flush=True,
-            )
+        print(table([line(row, {}) for row in new]), flush=True)
         rows += new
     print("\n".join(aims(rows)))
     write(args.output, [line(row, facts) for row in rows])

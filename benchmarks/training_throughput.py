@@ -10,6 +10,8 @@ initial policy's spread, frames per iteration, minibatch and epochs (those of pr
 of threads. The rest is what each does by default: ours sees a goal, standardises its inputs and takes fused Adam steps.
 
 A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` measures others than the default.
+With ``--before PYTHON``, an interpreter that has another version of this library, ``before-METHOD-PRECISION`` is that
+version, side by side with this one.
 Each has a process of its own, in which the first iteration is not counted. They then take turns, one iteration each per
 round, while the others wait, so that a busy machine slows all of them. A speed is the median over rounds, a ratio the
 median of the rounds'.
@@ -45,7 +47,7 @@ Iteration = dict[str, Any]
 """What a worker reports: ``seconds``, peak ``memory`` in MiB, and ``shares`` of the seconds by section."""
 
 
-def configuration(*overrides: str) -> DictConfig:
+def composed(*overrides: str) -> DictConfig:
     """Return the configuration of a training run."""
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return compose("train", list(overrides))
@@ -80,7 +82,6 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         "task": "holdout",
         "task.directions.pretrain": [0, 0],  # +x, where the reward is that of Ant-v5
         "task.pretrain.max_episode_steps": 1000,
-        "task.pretrain.contact_forces": False,
         "autocast": precision == "bf16",
         "optimizer.actor.lr": STEP_SIZE,
         "optimizer.critic.lr": STEP_SIZE,
@@ -91,7 +92,7 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         "run_dir": ".",
         **{f"training.{key}": value for key, value in training.items()},
     }
-    cfg = configuration(*(f"{key}={value}" for key, value in settings.items()))
+    cfg = composed(*(f"{key}={value}" for key, value in settings.items()))
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, Path(cfg.run_dir))
     turns = Turns()
@@ -133,7 +134,7 @@ def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
         env_kwargs={"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0},
         vec_env_cls=classes[vec_env],
     )
-    cells, std = [1024, 512], configuration("method=scratch").parts.policy.std
+    cells, std = [1024, 512], composed("method=scratch").parts.policy.std
     ppo = PPO(
         "MlpPolicy",
         env,
@@ -154,7 +155,7 @@ def worker(name: str, training: dict[str, int], threads: int) -> None:
 
     torch.set_num_threads(threads)
     family, kind, detail = name.split("-")
-    {"ours": ours, "sb3": sb3}[family](kind, detail, training)
+    {"ours": ours, "before": ours, "sb3": sb3}[family](kind, detail, training)
 
 
 def peak_memory(pid: int) -> float:
@@ -182,14 +183,17 @@ def iterate(name: str, process: subprocess.Popen) -> Iteration:
     raise SystemExit(f"{name} failed, see above")
 
 
-def measure(contenders: list[str], training: dict[str, int], threads: int, rounds: int) -> dict[str, list[Iteration]]:
-    """Return every contender's iterations, one per round."""
+def measure(
+    contenders: list[str], training: dict[str, int], threads: int, rounds: int, before: str
+) -> dict[str, list[Iteration]]:
+    """Return every contender's iterations, one per round; ``before`` is the interpreter of those of that name."""
     processes: dict[str, subprocess.Popen] = {}
     pipe, settings = subprocess.PIPE, ["--threads", str(threads), "--worker", json.dumps(training)]
     with TemporaryDirectory() as folder:
         try:
             for name in contenders:
-                command, home = [sys.executable, str(SCRIPT), *settings, name], Path(folder, name)
+                python = before if name.startswith("before") else sys.executable
+                command, home = [python, str(SCRIPT), *settings, name], Path(folder, name)
                 home.mkdir()
                 processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=home)
                 iterate(name, processes[name])
@@ -240,6 +244,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small batches, fewer contenders and rounds")
     parser.add_argument("--contenders", nargs="+", metavar="NAME")
+    parser.add_argument(
+        "--before", default=sys.executable, metavar="PYTHON", help="interpreter of before-... contenders"
+    )
+    parser.add_argument("--rounds", type=int, help="iterations of every contender")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads of every contender")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--worker", nargs=2, help=argparse.SUPPRESS)
@@ -248,15 +256,15 @@ def main() -> None:
         worker(args.worker[1], json.loads(args.worker[0]), args.threads)
         return
 
-    preset = configuration("preset=fast").training
+    preset = composed("preset=fast").training
     training = QUICK_TRAINING if args.quick else {key: preset[key] for key in QUICK_TRAINING}
     contenders = available(args.contenders or (QUICK_CONTENDERS if args.quick else CONTENDERS))
     if not contenders:
         return
-    rounds = 2 if args.quick else 10
+    rounds = args.rounds or (2 if args.quick else 10)
     conditions = {**training, "step_size": STEP_SIZE, "threads": args.threads, "rounds": rounds, **about()}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()), flush=True)
-    rows = summaries(measure(contenders, training, args.threads, rounds), training["frames_per_batch"])
+    rows = summaries(measure(contenders, training, args.threads, rounds, args.before), training["frames_per_batch"])
     print(table(rows))
     for row in rows:
         if row["contender"].startswith("ours-scratch") and row["of_best_sb3"]:

@@ -1,4 +1,4 @@
-"""Where in its reference motions a character fails."""
+"""The adaptive sampler of reference motions, which prefers moments where episodes end."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ from torchrl_mcp.envs.motions.library import MotionLibrary
 PERIOD = 1.0
 """Seconds of a clip that are counted together, and how long before a failure an attempt to avoid it may begin."""
 
-MEMORY = 0.9997
+DECAY = 0.9997
 """Share of the counts that remains after a control step: they reach back about 100 s."""
 
 PRIOR_STEPS, PRIOR_FAILURES = 100.0, 1.0
@@ -16,7 +16,7 @@ PRIOR_STEPS, PRIOR_FAILURES = 100.0, 1.0
 
 
 class AdaptiveSampler:
-    r"""Counts how often references are lost, second by second, and draws moments accordingly.
+    r"""A sampler of moments in reference motions, weighted by how often references are lost there.
 
     .. math:: P(j) \propto W_j \lambda_j
 
@@ -51,7 +51,7 @@ class AdaptiveSampler:
         last = (durations / PERIOD).ceil().long() - 1
         periods = self._first[clips] + torch.minimum((within / PERIOD).long(), last.clamp_min(0))
         steps, failures = (torch.bincount(chosen, minlength=len(self.steps)) for chosen in (periods, periods[failed]))
-        self.steps, self.failures = MEMORY * self.steps + steps, MEMORY * self.failures + failures
+        self.steps, self.failures = DECAY * self.steps + steps, DECAY * self.failures + failures
 
     def draw(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw moments: clips ``(num,)``, int64, and times in seconds ``(num,)``, float64."""

@@ -1,4 +1,4 @@
-"""Checks of what users pass."""
+"""Checks of arguments."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What the environments of all characters and tasks share."""
+"""The base class of all environments."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
     A task says what is observed, rewarded and ended and how an episode begins, in the methods at the end of this class.
-    The class owns stepping, specs, partial resets, seeding, the time limit, snapshots and faults. What a task remembers
+    The class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. What a task remembers
     beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
 
     A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward
@@ -41,8 +41,8 @@ class CharacterEnv(EnvBase):
         persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         current: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
         dtype: Type of what is emitted; physics and reward are computed in float64.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (TorchRL merges what a partial
-            reset emits into new tensors, which are not pinned.)
+        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
+            TorchRL merges what a partial reset emits into new tensors, which are not pinned.)
 
     Raises:
         ValueError: If an argument is out of range.
@@ -101,6 +101,11 @@ class CharacterEnv(EnvBase):
         self._dtype, self._pin_memory = dtype, pin_memory
         self._cameras: dict[tuple[int, int], Camera] = {}
 
+    @classmethod
+    def characters(cls) -> tuple[str, ...]:
+        """Return the names of the characters that can do the task, or nothing where it does not say."""
+        return ()
+
     @property
     def physics_seconds(self) -> float:
         """Wall-clock seconds spent inside MuJoCo so far."""
@@ -116,18 +121,18 @@ class CharacterEnv(EnvBase):
         return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """All that training needs to continue: the snapshot, the generator and the count of faults (``state_dict``)."""
+        """State of a training: the snapshot, the generator and the count of divergences (``state_dict``)."""
         return {
             "snapshot": dict(self.get_state()),
             "generator": self.generator.get_state(),
-            "faults": self.num_diverged,
+            "diverged": self.num_diverged,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
         self._snapshot = TensorDict(state["snapshot"], self.batch_size)
         self.generator.set_state(state["generator"].cpu())
-        self.num_diverged = state["faults"]
+        self.num_diverged = state["diverged"]
 
     def render(self, index: int = 0, *, width: int = 480, height: int = 480, distance: float = 4.0) -> Tensor:
         """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
@@ -168,6 +173,22 @@ class CharacterEnv(EnvBase):
         drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
         self.generator.manual_seed(drawn)
 
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step all simulations and begin new episodes where they have ended; see ``EnvBase.step_and_maybe_reset``.
+
+        The same as TorchRL's, but for what is known here: specs hold by construction, and what :meth:`_emit` tells
+        after a partial reset is what is shown of all simulations, so that nothing needs merging.
+        """
+        if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:
+            return super().step_and_maybe_reset(tensordict)  # the caller prescribes the outcome, or who takes part
+        outcome = self._step(tensordict)
+        tensordict.set("next", outcome)
+        state = self._step_mdp(tensordict)
+        ended = outcome["done"].view(self.num_envs).nonzero().squeeze(-1)
+        if len(ended):
+            state.update(self._begin_episodes(ended, {}))
+        return tensordict, state
+
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["action"]
         expected = (self.num_envs, self.simulation.model.nu)
@@ -176,12 +197,12 @@ class CharacterEnv(EnvBase):
                 f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on the CPU, "
                 "where the physics runs"
             )
-        faults = self.simulation.step(self._controls(action))
+        diverged = self.simulation.step(self._controls(action))
         self.episode["elapsed_steps"] += 1
-        reward, terminated = self._reward_and_termination(faults)
-        if len(faults):
-            reward[faults], terminated[faults] = 0.0, True
-            self.num_diverged += len(faults)
+        reward, terminated = self._reward_and_termination(diverged)
+        if len(diverged):
+            reward[diverged], terminated[diverged] = 0.0, True
+            self.num_diverged += len(diverged)
         truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._truncation()
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
@@ -191,7 +212,10 @@ class CharacterEnv(EnvBase):
             snapshot, self._snapshot = self._snapshot, None
             return self._reset(snapshot, set_state=True)
         ids = torch.arange(self.num_envs) if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
-        state = self._checked(tensordict, ids) if set_state else {}
+        return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
+
+    def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
+        """Begin episodes in the simulations ``ids``; what their ``state`` does not say is drawn."""
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
             state = {**self._sample(len(ids)), **state}
@@ -221,7 +245,10 @@ class CharacterEnv(EnvBase):
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
         """What is told of all simulations, of which only ``ids`` have changed since the last time."""
         for key, value in self._observe(ids).items():
-            self._observed[key][ids] = value.to(self._type(value))
+            if isinstance(ids, slice):
+                self._observed[key].copy_(value)
+            else:
+                self._observed[key][ids] = value.to(self._type(value))
         emitted = {key: value.clone() for key, value in self._observed.items()}
         emitted.update(terminated=terminated, truncated=truncated, done=terminated | truncated)
         if reward is not None:
@@ -261,11 +288,11 @@ class CharacterEnv(EnvBase):
         """
 
     @abstractmethod
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
 
         Args:
-            faults: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
+            diverged: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
         """
 
     @property

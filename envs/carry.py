@@ -75,7 +75,7 @@ class Carry(Transport):
         )
         model, outputs, state = self.simulation.model, self.simulation.outputs, self.simulation.state
         width, (target, source) = math.sqrt(2) * HALF_SIZE, mocap_positions(model)[:, 2].tolist()
-        self._clearance = width + self._reach(target - TOP_THICKNESS, source + 2 * HALF_SIZE)
+        self._clearance = width + self._extent(target - TOP_THICKNESS, source + 2 * HALF_SIZE)
         self.object_distances = clear_of("object_distances", self.object_distances, self._clearance)
         self.target_distances = clear_of("target_distances", self.target_distances, 2 * width)
         # Live views, made once.
@@ -111,8 +111,8 @@ class Carry(Transport):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "taken": torch.zeros(len(ids))}
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
-        judged = super()._reward_and_termination(faults)
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+        judged = super()._reward_and_termination(diverged)
         touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
         closing, opening = self._standing(touching, "source"), self._standing(self._joined == 1, "target")
         if len(closing):

@@ -65,7 +65,7 @@ class Dribble(Transport):
             object_distances=object_distances,
             **kwargs,
         )
-        clearance = self._reach(0.0, 2 * RADIUS) + RADIUS
+        clearance = self._extent(0.0, 2 * RADIUS) + RADIUS
         self.object_distances = clear_of("object_distances", self.object_distances, clearance)
         self._make_specs()
 

@@ -1,4 +1,4 @@
-"""One simulation at a time, as Gymnasium wants it."""
+"""Gymnasium environments of a single simulation."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -71,10 +71,10 @@ class GymnasiumEnv(gymnasium.Env):
         self.env.close()
 
     def _measured(self, outcome: TensorDictBase) -> dict[str, float]:
-        measures: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         for key, names in self.env.metric_names.items():
-            measures |= zip(names, outcome[key][0].tolist(), strict=True)
-        return measures
+            metrics |= zip(names, outcome[key][0].tolist(), strict=True)
+        return metrics
 
     def _observed(self, outcome: TensorDictBase) -> dict[str, np.ndarray]:
         return {key: outcome[key][0].numpy() for key in ("observation", "goal")}

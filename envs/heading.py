@@ -82,7 +82,7 @@ class Heading(PDCharacterEnv):
         angle = self.heading(ids)
         return {"observation": self._state(ids, angle), "goal": unit_vector(self.episode["direction"][ids] - angle)}
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         direction = self.episode["direction"]
         reward = heading_reward(self._com_velocity(), unit_vector(direction), self.speed)
         direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)

@@ -123,6 +123,11 @@ class Holdout(CharacterEnv):
         self._torso = self.simulation.outputs["xpos"][:, TORSO, :2]
         self._make_specs()
 
+    @classmethod
+    def characters(cls) -> tuple[str, ...]:
+        """See :meth:`CharacterEnv.characters`: Gymnasium's ant alone."""
+        return ("ant",)
+
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 earns nothing and 1 is what Gymnasium calls solved, unclipped.
 
@@ -158,14 +163,14 @@ class Holdout(CharacterEnv):
             parts.append(self.episode["contact_forces"][ids, 1:].flatten(1))  # Ant-v5 leaves the world body out
         return {"observation": torch.cat(parts, -1), "goal": self.episode["goal"][ids]}
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         velocity = (self._torso - self.episode["position"]) / self.control_timestep
         self.episode["position"].copy_(self._torso)
         healthy = self._height == self._height.clamp(*self.healthy_z_range)
         contacts = None
         if "contact_forces" in self.episode:
             forces = self.simulation.contact_forces().clamp(*CONTACT_FORCE_RANGE)
-            forces[faults] = self.episode["contact_forces"][faults]
+            forces[diverged] = self.episode["contact_forces"][diverged]
             contacts = self.episode["contact_forces"].copy_(forces).flatten(1)
         action = self.simulation.state["ctrl"]
         reward = self._reward(velocity, self.episode["goal"], action, healthy, contacts)

@@ -1,4 +1,4 @@
-"""Motion imitation: the task from which primitives are pre-trained."""
+"""The imitation task: follow reference motions, which is how primitives are pre-trained."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -64,8 +64,9 @@ class Imitation(PDCharacterEnv):
         clips: Reference motions of that character: a library, or clips by name.
         num_envs: Number N of simulations.
         terms: Weight and scale of each error in the reward, by name.
-        max_error: Largest mean distance of bodies from the reference, in metres.
-        switch_interval: Mean time between changes of the reference, in seconds; infinite for none.
+        max_error: Largest mean distance of bodies from the reference, in metres; 0.5 is clearly worse than 0.3.
+        switch_interval: Mean time between changes of the reference, in seconds; infinite for none. The paper does not
+            say.
         switch_candidates: Number of random moments of which the most similar becomes the reference: 1 asks for motions
             that no body can go over to, as from a fast walk to standing, and with more of them changes become easier.
         switch_to: ``"any"`` clip, or the ``"same"``, which brings a reference back to a character that has drifted off
@@ -95,7 +96,7 @@ class Imitation(PDCharacterEnv):
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
-        switch_candidates: int = 1,
+        switch_candidates: int = 16,
         switch_to: str = "any",
         clip_end: str = "truncate",
         failure_weighting: float = 0.0,
@@ -168,7 +169,7 @@ class Imitation(PDCharacterEnv):
 
     def get_extra_state(self) -> dict[str, Any]:
         """See :meth:`CharacterEnv.get_extra_state`; and what motions there are, and where references are lost."""
-        own = {"motions": self.library.digest, "difficulty": self._sampler.state_dict()}
+        own = {"motions": self.library.digest, "sampler": self._sampler.state_dict()}
         return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -183,7 +184,7 @@ class Imitation(PDCharacterEnv):
                 "begin another from it with stage=pretrain pretrained=<folder>"
             )
         super().set_extra_state(state)
-        self._sampler.load_state_dict(state["difficulty"])
+        self._sampler.load_state_dict(state["sampler"])
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
@@ -227,7 +228,7 @@ class Imitation(PDCharacterEnv):
         self._next = first if isinstance(ids, slice) else self._next.replaced(ids, first)
         return targets
 
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         self.episode["time"] += CONTROL_TIMESTEP
         reference = self._next
         error = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1).mean(-1)
@@ -250,9 +251,9 @@ class Imitation(PDCharacterEnv):
             return
         each = ids.repeat(self.switch_candidates)
         clips, times = self._draw(len(each), self.episode["clip"][each] if self.switch_to == "same" else None)
-        placement = placing(self.library.at(clips, times).qpos, self.simulation.state["qpos"][each])
-        references = self.library.at(clips, times, placement)
-        best = mismatch(self._body_states(each), references.bodies).view(-1, len(ids)).argmin(0)
+        moments = self.library.at(clips, times)
+        placement = placing(moments.qpos, self.simulation.state["qpos"][each])
+        best = mismatch(self._body_states(each), moments.carried(placement).bodies).view(-1, len(ids)).argmin(0)
         chosen = best * len(ids) + torch.arange(len(ids))
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
         for key, values in changed.items():

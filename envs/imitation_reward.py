@@ -1,4 +1,4 @@
-"""How well a character follows a reference motion, as functions of tensors."""
+"""The imitation reward, as functions of tensors."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The OpenGL with which MuJoCo draws into memory, found without being told."""
+"""OpenGL contexts for drawing without a display, and the search for a library that has them."""
 
 import os
 import subprocess
@@ -22,7 +22,7 @@ mujoco.MjrContext(mujoco.MjSpec().compile(), mujoco.mjtFontScale.mjFONTSCALE_100
 
 
 class GLContext(Protocol):
-    """What MuJoCo's contexts of all platforms can do."""
+    """The interface of MuJoCo's OpenGL contexts on all platforms."""
 
     def make_current(self) -> None:
         """Let what is drawn next be drawn here."""

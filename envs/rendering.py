@@ -1,11 +1,14 @@
-"""Pictures of a simulation, without a display, and what is drawn beside it."""
+"""Pictures of a simulation without a display, shapes drawn into them, and GIFs."""
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from torchrl_mcp.envs.opengl import new_context
@@ -18,6 +21,9 @@ Colour = tuple[float, float, float, float]
 
 RED: Colour = (0.9, 0.1, 0.1, 1.0)
 PALE: Colour = (0.30, 0.58, 0.95, 0.38)
+
+GIF_COLOURS = 64
+"""Number of colours of a picture in a GIF: the file is half as large as with 256."""
 
 MAX_SHAPES = 2000
 """Of a scene. MuJoCo reserves room for them."""
@@ -120,3 +126,14 @@ class Camera:
         self._opengl.make_current()
         self._context.free()
         self._opengl.free()
+
+
+def save_gif(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
+    """Write RGB pictures as an animated GIF, one every ``interval`` seconds."""
+    # An octree keeps the colours of small parts.
+    octree, plain = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+    first, *others = (picture.quantize(GIF_COLOURS, octree, dither=plain) for picture in pictures)
+    # A GIF counts in hundredths of a second: what is rounded off one picture is added to the next.
+    ticks = [round(100 * interval * number) for number in range(len(others) + 2)]
+    durations = [10 * (end - begin) for begin, end in pairwise(ticks)]
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)

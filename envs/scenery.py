@@ -1,4 +1,4 @@
-"""What a task means, drawn beside its simulation: arrows to targets, and the reference as a ghost."""
+"""Shapes that explain a task: arrows to targets, and the reference as a ghost."""
 
 import copy
 
@@ -59,7 +59,7 @@ def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def reach(model: mujoco.MjModel) -> float:
+def extent(model: mujoco.MjModel) -> float:
     """Return how far the first body below the world, in its rest pose, extends from its centre of mass, in metres."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

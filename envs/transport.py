@@ -1,4 +1,4 @@
-"""What carrying and dribbling have in common: an object, a target, and the way between them."""
+"""The base class of carrying and dribbling: an object, a target, and the way between them."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -94,6 +94,7 @@ class Transport(PDCharacterEnv):
         rows, outputs = slice(1 + len(self._bodies), None), self.simulation.outputs
         angular, linear = outputs["cvel"][:, rows].split(3, -1)
         self._things = BodyStates(outputs["xpos"][:, rows], outputs["xquat"][:, rows], linear, angular)
+        self._look_at(slice(1, None))  # seen together, they take little longer than the character alone
         self._target, self._object = self._things.positions[:, 0], self._things.positions[:, -1]
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
@@ -108,9 +109,9 @@ class Transport(PDCharacterEnv):
         """Whether the object is at the target, shape ``(N,)``, bool."""
         return torch.linalg.vector_norm((self._object - self._target)[:, :2], dim=-1) < SUCCESS_DISTANCE
 
-    def _reach(self, low: float, high: float) -> float:
+    def _extent(self, low: float, high: float) -> float:
         """Furthest that the character's rest pose extends from its root between two heights, all in metres."""
-        return reach(self.simulation.model, len(self._bodies), low, high)
+        return horizontal_extent(self.simulation.model, len(self._bodies), low, high)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         start = super()._sample(num)
@@ -141,12 +142,7 @@ class Transport(PDCharacterEnv):
             "success": self.success()[ids].unsqueeze(-1),
         }
 
-    def _body_states(self, ids: Tensor | slice) -> BodyStates:
-        """The character's bodies and the things: seen together, they take little longer than the character alone."""
-        things = (part[ids].to(self._dtype) for part in self._things)
-        return BodyStates(*(torch.cat(parts, 1) for parts in zip(super()._body_states(ids), things, strict=True)))
-
-    def _reward_and_termination(self, faults: Tensor) -> tuple[Tensor, Tensor]:
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
         self.episode["object"].copy_(self._object)
         reward = self._reward(
@@ -202,7 +198,7 @@ def mocap_positions(model: mujoco.MjModel) -> Tensor:
     return torch.from_numpy(model.body_pos[model.body_mocapid >= 0])
 
 
-def reach(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
+def horizontal_extent(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
     """How far a character's rest pose extends horizontally from its root.
 
     Args:

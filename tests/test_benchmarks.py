@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-ABOUT = {"commit", "date", "cpu", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
+ABOUT = {"commit", "date", "processor", "instructions", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
 
 
 def run(script, output, *arguments):
@@ -72,6 +72,15 @@ def test_characters_are_measured(tmp_path, what):
         assert all(0 < float(row["smooth"]) < 0.1 for row in rows)
     else:
         assert all(row["diverged"] == "0" for row in rows)
+
+
+def test_legs_are_measured_in_the_corpus_and_as_the_built_in_network_moves_them(tmp_path):
+    rows = run("legs_apart.py", tmp_path / "out.csv", "--characters", "biped")
+    assert [row["motion"] for row in rows] == ["generated corpus", "built-in network"]
+    for row in rows:
+        assert int(row["frames"]) > 10
+        assert float(row["deepest_mm"]) >= 0
+        assert 1 >= float(row["deeper_than_0_mm"]) >= float(row["deeper_than_20_mm"]) >= 0
 
 
 def test_tasks_are_measured_beside_bare_mujoco(tmp_path):

@@ -2,7 +2,6 @@
 
 import doctest
 import importlib
-import inspect
 import re
 import shlex
 import sys
@@ -12,7 +11,6 @@ from types import ModuleType
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs.characters import CHARACTERS
@@ -128,8 +126,7 @@ def exists(cfg, name):
         return False
     if not name.startswith("+"):
         return last in parent
-    classes = getattr(get_object(parent._target_), "__mro__", ())
-    return last not in parent and any(last in inspect.signature(kind.__init__).parameters for kind in classes)
+    return last not in parent and last in build.arguments(parent._target_)
 
 
 @pytest.mark.parametrize("page", pages_with(INCLUDE), ids=lambda path: path.stem)

@@ -1,28 +1,34 @@
 """Every method from pre-training to transfer, evaluation and a resumed run, in one iteration or two each."""
 
+import ast
 import csv
 import shutil
+from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 
+import torchrl_mcp
+from torchrl_mcp import conf
+from torchrl_mcp.report.comparison import choices
+from torchrl_mcp.report.results import read_run
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.transfer import fingerprint
 
 ANT = (["task=holdout"], ["task=holdout"])
-BIPED = (["task=imitation", "motions=single", "character=biped"], ["task=heading", "character=biped"])
-CLIPS = (["task=imitation", "character=biped"], ["task=heading", "character=biped", "batch_factor=1"])
-CASES = {
-    "scratch": ANT,
-    "finetune": ANT,
-    "finetune to another goal": BIPED,
-    "hierarchical": CLIPS,
-    "option_critic": ANT,
-    "moe": ANT,
-    "latent_space": BIPED,
-    "mcp": ANT,
-}
+BIPED = (["task=imitation", "character=biped"], ["task=heading", "character=biped"])
+
+
+def place(file):
+    """Tasks of pre-training and transfer: imitation for a method that has reference motions of its own."""
+    return BIPED if "override /motions" in file.read_text() else ANT
+
+
+FILES = sorted((Path(conf.__file__).parent / "method").glob("*.yaml"))
+CASES = {file.stem: (file.stem, place(file)) for file in FILES}
+CASES["finetune to the same goal"] = ("finetune", ANT)
 
 SMALL = [
     "training.frames_per_batch=64",
@@ -52,10 +58,11 @@ def fingerprints(folder):
 @pytest.fixture(scope="module", params=CASES)
 def runs(request, tmp_path_factory):
     """Run folders of pre-training, or None where there is none, and of transfer."""
-    folder, method = tmp_path_factory.mktemp("runs"), f"method={request.param.split()[0]}"
-    pretraining, transfer = CASES[request.param]
+    folder, (name, (pretraining, transfer)) = tmp_path_factory.mktemp("runs"), CASES[request.param]
+    method = f"method={name}"
     transfer = [method, "stage=transfer", *transfer, "training.total_frames=128", "checkpoint_interval=1"]
-    if method == "method=scratch":
+    transfer.append("++batch_factor=1")
+    if not configure(folder, *transfer).transfer.keep:
         return None, experiment.train(configure(folder / "transfer", *transfer))
     pretrained = experiment.train(
         configure(folder / "pretrain", method, "stage=pretrain", "autocast=false", *pretraining)
@@ -92,13 +99,11 @@ def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs):
         assert 1 <= numbers["length"] <= 5
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
     assert results["deterministic"]["return"] != results["stochastic"]["return"]
-    cfg, _, _ = experiment.restore(runs[1], num_envs=1, seed=0)
-    chosen = {"mcp": "gates/effective_primitives", "moe": "gates/effective_primitives"}
-    chosen |= dict.fromkeys(("hierarchical", "option_critic"), "options/effective_options")
-    if name := chosen.get(cfg.method.name):
-        assert 1 <= results["stochastic"]["diagnostics"][name] <= 8 + 1e-4
-    else:
-        assert results["stochastic"]["diagnostics"] == {}
+    _, agent, _ = experiment.restore(runs[1], num_envs=1, seed=0)
+    found = results["stochastic"]["diagnostics"]
+    for key, name in {"gates": "gates/effective_primitives", "begins": "options/effective_options"}.items():
+        assert (name in found) == (key in agent.actor.stored)
+        assert 1 <= found.get(name, 1) <= 8 + 1e-4
 
 
 def test_before_an_update_the_loss_sees_the_policy_that_collected(runs):
@@ -113,3 +118,23 @@ def test_before_an_update_the_loss_sees_the_policy_that_collected(runs):
             assert abs(float(row["loss/max_ratio"]) - 1) <= tolerance
             assert abs(float(row["loss/kl_approx"])) <= tolerance
             assert float(row["loss/ESS"]) == pytest.approx(1, abs=tolerance)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_method_tells_its_name_its_title_and_the_settings_by_which_it_is_known(file, tmp_path):
+    cfg = configure(tmp_path, f"method={file.stem}", "stage=transfer", "task=heading", "character=biped")
+    others = [other for other in FILES if other != file]
+    assert cfg.method.name == file.stem
+    assert f"title: {cfg.method.title}\n" in file.read_text()
+    assert not any(f"title: {cfg.method.title}\n" in other.read_text() for other in others)
+    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
+    run = read_run(tmp_path)
+    assert {name: choices(run)[name] for name in run.standard} == run.standard
+
+
+def test_the_library_chooses_nothing_by_the_name_of_a_method():
+    spoken = {"paper.py", "builtin.py", "demo.py"}  # Table 2, the networks that come along, MCP against scratch
+    names = {file.stem for file in FILES}
+    for path in Path(torchrl_mcp.__file__).parent.rglob("*.py"):
+        literals = {node.value for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)}
+        assert path.name in spoken or not literals & names, path

@@ -1,4 +1,4 @@
-"""Bodies: what MuJoCo needs to simulate them, and nothing of any task."""
+"""Bodies as MuJoCo simulates them, without any task."""
 
 from torchrl_mcp.envs.characters.ant import ant
 from torchrl_mcp.envs.characters.biped import BIPED

@@ -1,4 +1,4 @@
-"""What MuJoCo's file of a body cannot say about it."""
+"""The description of a body, with what its MuJoCo file cannot hold."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files

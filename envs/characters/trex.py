@@ -1,4 +1,4 @@
-"""Our Tyrannosaurus."""
+"""The T-Rex."""
 
 from torchrl_mcp.envs.characters.character import Character
 

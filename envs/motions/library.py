@@ -72,6 +72,10 @@ class PlacedMotion:
             velocities = (self._each.vectors(velocities[0]), self._each.vectors(velocities[1]))
         return BodyStates(self.positions, self.orientations, *velocities)
 
+    def carried(self, placement: Placement) -> "PlacedMotion":
+        """Return these moments carried further, by N turns and shifts."""
+        return PlacedMotion(self.moment, placement if self.placement is None else placement.after(self.placement))
+
     def __getitem__(self, index: slice) -> "PlacedMotion":
         """Some of the moments."""
         return self._of([part[index] for part in self._parts()])
@@ -163,10 +167,9 @@ class MotionLibrary:
         orientations = quaternions[..., self._num_turns :].mT
         positions, linear, angular = (part.unflatten(-1, (3, -1)).mT for part in moments[2:5])
         state = MotionState(qpos, moments[5], BodyStates(positions, orientations, linear, angular))
-        if cycles.any():
-            cycle = Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles)
-            placement = cycle if placement is None else placement.after(cycle)
-        return PlacedMotion(state, placement)
+        looped = Placement(self._cycles.turn[clips], self._cycles.shift[clips]).power(cycles) if cycles.any() else None
+        motion = PlacedMotion(state, looped)
+        return motion if placement is None else motion.carried(placement)
 
     def sample(self, num: int, generator: torch.Generator, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Draw moments: clips by their weights, times evenly over a clip or a cycle of it.

@@ -231,8 +231,8 @@ def _leg(side: str, position: Tensor, orientation: Tensor, heading: Tensor, step
     )
     foot_angle = torch.atan2(x, down) + smooth(METATARSUS, step.phase)
     x, down = x - metatarsus * foot_angle.sin(), down - metatarsus * foot_angle.cos()
-    reach = torch.hypot(x, down)
-    hip_angle = torch.atan2(x, down) + torch.acos((thigh**2 + reach**2 - shank**2) / (2 * thigh * reach))
+    line = torch.hypot(x, down)
+    hip_angle = torch.atan2(x, down) + torch.acos((thigh**2 + line**2 - shank**2) / (2 * thigh * line))
     knee_angle = torch.atan2(x - thigh * hip_angle.sin(), down - thigh * hip_angle.cos())
     turns = [hip_angle - thigh_rest, knee_angle - shank_rest, foot_angle - metatarsus_rest]
     return {

@@ -11,16 +11,12 @@ from torchrl_mcp.analysis.exploration import (
     FALLEN,
     UPRIGHT,
     Exploration,
-    RandomSequence,
     action_noise,
     draw_exploration,
     explore,
-    fixed_latent,
-    fixed_weights,
     path_rows,
-    summary,
+    path_statistics,
 )
-from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Heading
 
 
@@ -35,31 +31,6 @@ def paths(*ends, fallen=(), steps=10, timestep=0.1):
     positions[-1] = np.nan  # evaluation does not know the last position
     positions[steps // 2 :, ended] = np.nan
     return Exploration(positions, ended, timestep)
-
-
-def test_fixed_weights_play_the_mean_of_the_weighted_product():
-    loc, scale, gates = torch.randn(5, 3, 2), torch.rand(5, 3, 2) + 0.5, torch.rand(5, 3)
-    precision = gates.unsqueeze(-1) / scale.square()
-    expected = (precision * loc).sum(1) / precision.sum(1)
-    act = fixed_weights(lambda state: (loc + state, scale), MultiplicativeGaussian, gates)
-    for state in (0.0, 1.0):
-        torch.testing.assert_close(act(torch.tensor(state)), expected + state)
-
-
-def test_fixed_latents_are_decoded_into_the_mean_action():
-    latent = torch.randn(4, 2)
-    act = fixed_latent(lambda state, w: (state + w, None), latent)
-    torch.testing.assert_close(act(torch.ones(4, 2)), latent + 1)
-
-
-def test_a_random_sequence_lets_each_primitive_act_for_a_while():
-    act = RandomSequence(lambda state, option: (option, None), num_options=3, steps=4, generator=generator())
-    options = torch.stack([act(torch.zeros(50, 1)) for _ in range(40)]).unflatten(0, (10, 4))
-    assert (options == options[:, :1]).all()
-    shares = options[:, 0].flatten().bincount() / 500
-    assert shares == pytest.approx([1 / 3] * 3, abs=0.06)
-    changes = (options[1:, 0] != options[:-1, 0]).float().mean()
-    assert changes == pytest.approx(2 / 3, abs=0.07)
 
 
 def test_noise_has_the_deviation_asked_for():
@@ -88,15 +59,15 @@ def test_who_is_thrown_goes_as_far_as_speed_times_time():
 
 def test_a_summary_counts_falls_distances_and_directions():
     result = paths((4.0, 0.0), (0.0, 2.0), (-1.0, 0.0), (0.0, -2.0), fallen=[2])
-    numbers = summary(result)
+    numbers = path_statistics(result)
     assert numbers["trajectories"] == 4
     assert numbers["upright"] == 0.75
     np.testing.assert_allclose(result.seconds, [1.0, 1.0, 0.5, 1.0])
     assert numbers["seconds"] == 1.0
     assert numbers["distance"] == pytest.approx(0.9 * 2.0)  # of 3.6, 1.8, 0.4 and 1.8
     assert numbers["spread"] == pytest.approx(1.0)
-    assert summary(paths((4.0, 0.0), (1.0, 0.0)))["spread"] == pytest.approx(0.0)
-    assert summary(paths((1.0, 0.0), (0.0, 1.0)))["spread"] == pytest.approx(1 - math.sqrt(0.5))
+    assert path_statistics(paths((4.0, 0.0), (1.0, 0.0)))["spread"] == pytest.approx(0.0)
+    assert path_statistics(paths((1.0, 0.0), (0.0, 1.0)))["spread"] == pytest.approx(1 - math.sqrt(0.5))
 
 
 def test_a_path_has_a_row_every_fifth_of_a_second_until_its_end():

@@ -52,7 +52,7 @@ def contents(folder):
 
 
 def configurations(folder, *overrides):
-    return {name: demo.configuration(folder / name, [*own, *overrides]) for name, own in demo.RUNS.items()}
+    return {name: demo.configure(folder / name, [*own, *overrides]) for name, own in demo.RUNS.items()}
 
 
 def test_it_was_killed_after_pretraining_and_before_the_end(finished):
@@ -105,7 +105,7 @@ def test_the_table_holds_the_numbers_of_an_evaluation_on_the_held_out_directions
 
 def test_an_existing_folder_with_other_settings_is_refused(finished):
     with pytest.raises(ValueError, match="holds a run with other settings: give another --output"):
-        demo.configuration(finished.folder / "pretrain", [*demo.RUNS["pretrain"], *SMOKE, "seed=1"])
+        demo.configure(finished.folder / "pretrain", [*demo.RUNS["pretrain"], *SMOKE, "seed=1"])
 
 
 def test_the_full_budget_keeps_a_checkpoint_of_scratch_after_as_many_steps_as_transfer(tmp_path):

@@ -83,7 +83,7 @@ def test_exploration_has_a_panel_per_checkpoint_and_one_of_noise(runs, tmp_path,
     numbers = rows(tmp_path / "exploration_biped_summary.csv")
     panels = [row["panel"] for row in numbers]
     assert [panel.partition(",")[0] for panel in panels] == [
-        "MCP", "MOE", "latent space", "hierarchical", "option-critic", "no primitives",
+        "MCP", "MOE", "Latent Space", "Hierarchical", "Option-Critic", "no primitives",
     ]  # fmt: skip
     assert all(panel in capsys.readouterr().out for panel in panels[:1])
     for row in numbers:
@@ -165,6 +165,7 @@ def test_holdout_draws_trajectories_by_direction_and_curves(runs, tmp_path, monk
         ("exploration", ["mcp", "ant"], "checkpoints are of biped and ant: give those of one character"),
         ("primitives", ["mcp"], "no complete stride"),
         ("primitives", ["latent"], "method=latent_space, which has no weights"),
+        ("primitives", ["sequence"], "method=hierarchical, which has no weights"),
         ("primitives", ["ant"], "task=holdout: Figure 7 is of pre-training"),
         ("holdout", ["mcp"], "task=imitation: Figure 5 is of task=holdout"),
         ("exploration", ["mcp", "mcp"], "a checkpoint is named twice"),

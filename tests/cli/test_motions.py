@@ -10,6 +10,8 @@ from PIL import Image
 
 from torchrl_mcp.cli import motions
 from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.gait.generator import stride
+from torchrl_mcp.envs.motions.trex import trex_walk
 
 COLUMNS = [0.1, 0.0, 0.9, 0.0, *[1.0, 0, 0, 0] * 4, -0.2, *[1.0, 0, 0, 0] * 2, 0.4, *[1.0, 0, 0, 0], -0.1]
 COLUMNS += [*[1.0, 0, 0, 0] * 2, 0.3]
@@ -49,7 +51,9 @@ def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     assert clips["walk"].fps == pytest.approx(20)
     assert torch.equal(clips["walk_mirrored"].qpos, clips["walk"].mirrored().qpos)
     lines = output.splitlines()
-    assert lines[1].split()[:-1] == ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg", "0.0", "cm"]
+    measured = ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg", "0.0", "cm", "0.0", "cm"]
+    assert lines[1].split()[:-2] == measured
+    assert lines[1].split()[-1] == "-"  # joints of the character itself have no rest pose
     assert lines[2].split()[4] == "0.30"
     assert [line.split()[0] for line in lines[2:5]] == ["stroll", "walk_mirrored", "stroll_mirrored"]
     assert lines[5].split() == ["total", "6.0"]
@@ -64,6 +68,38 @@ def test_clips_and_recordings_can_be_inspected(run, tmp_path):
     assert output.splitlines()[1].split()[:5] == ["walk", "biped", "1.00", "30", "loop"]
     assert run("inspect", "walk.txt", "--character", "biped")[1] == output
     assert {path.name for path in tmp_path.iterdir()} == {"walk.txt", "walk.npz"}
+
+
+def test_inspect_shows_the_strides_of_people_if_asked_to(run):
+    stride("humanoid", 1.0, 0.0, strides=8).save("walk.npz")
+    stride("biped", 0.8, 0.5, strides=8).save("turn.npz")
+    trex_walk(1.0, 0.0).save("trex.npz")
+    assert "steps/min" not in run("inspect", "walk.npz")[1]
+    status, output, errors = run("inspect", "walk.npz", "turn.npz", "trex.npz", "--strides")
+    assert (status, errors) == (0, "")
+    header, walk, turn = output.split("\n\n")[1].splitlines()
+    assert header.split()[:6] == ["clip", "strides", "length", "m", "steps/min", "width"]
+    name, strides, length, cadence, width, stance, double_support, *_ = walk.split()
+    assert name == "walk"
+    assert int(strides) >= 10
+    assert float(length) == pytest.approx(1.0 / 0.86, rel=0.02)  # 0.86 strides per second at 1 m/s
+    assert float(cadence) == pytest.approx(120 * 0.86, rel=0.02)
+    assert float(width) == pytest.approx(0.12, abs=0.01)
+    assert float(double_support) == pytest.approx(2 * float(stance) - 1, abs=0.02)
+    assert turn.split()[-1] == "-"  # without arms
+
+
+def test_a_clip_without_strides_is_said_to_have_none(run, tmp_path):
+    (tmp_path / "stand.txt").write_text(motion(1.0, speed=0.0))
+    assert run("inspect", "stand.txt", "--strides")[1].splitlines()[-1].split() == ["stand", "0", *["-"] * 10]
+
+
+def test_import_says_how_far_the_rest_pose_is_from_standing(run, mocap):
+    lines = run("inspect", mocap / "cmu" / "02_01.amc")[1].splitlines()
+    assert lines[0].endswith("rest pose leans")
+    assert float(lines[1].split()[-2]) < 10
+    striding = run("inspect", mocap / "cmu" / "02_01.amc", "--rest-frame", 100)[1].splitlines()[1]
+    assert float(striding.split()[-2]) > 30
 
 
 def test_render_draws_a_sheet_and_a_film(run, tmp_path):

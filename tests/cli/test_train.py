@@ -36,6 +36,20 @@ def test_an_unknown_setting_is_answered_with_the_nearest_that_exist(argument, me
     assert line.split("the nearest are: ")[1].split(", ")[0] == meant
 
 
+@pytest.mark.parametrize(
+    ("arguments", "written"),
+    [
+        (["imitation.switch_to=same"], "+imitation.switch_to="),
+        (["task=heading", "task.transfer.terminate_on_fall=false"], "+task.transfer.terminate_on_fall="),
+        (["critic.num_cells=[16]"], "+critic.num_cells="),
+    ],
+)
+def test_an_argument_that_no_file_names_is_answered_with_a_plus(arguments, written):
+    (line,) = suggestions(arguments)
+    assert written in line
+    assert suggestions([*arguments[:-1], f"+{arguments[-1]}"]) == []
+
+
 def test_a_setting_like_no_other_is_answered_with_the_groups():
     (line,) = suggestions(["qqqqqqqq=1"])
     for group in ("method", "mixer", "task", "preset"):
@@ -52,7 +66,7 @@ def test_a_setting_like_no_other_is_answered_with_the_groups():
         ["+note=new"],
         ["~logger"],
         pytest.param(["method=scratch", "parts.policy.std=0.2"], id="a setting of another method"),
-        pytest.param(["preset=paper", "step_size.mcp.pretrain=1e-4"], id="a setting of another preset"),
+        pytest.param(["preset=paper", "ppo.clip_epsilon=0.1"], id="a setting of another preset"),
     ],
 )
 def test_settings_that_exist_are_left_alone(arguments):

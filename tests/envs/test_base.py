@@ -2,6 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_mcp.envs import Holdout
@@ -103,6 +104,25 @@ def test_a_partial_reset_leaves_the_neighbours_alone():
     assert torch.equal(after["observation"][others], carrier["observation"][others])
     assert state["elapsed_steps"].flatten().tolist() == [3, 0, 3, 3]
     assert (state["qpos"][1, 2] - 0.75).abs() <= 0.1
+
+
+def test_steps_and_partial_resets_are_those_that_torchrl_makes():
+    (ours, torchrls) = (make(8, max_episode_steps=20) for _ in range(2))
+    state, expected_state, num_ended = ours.reset(), torchrls.reset(), 0
+    for action in actions(60, 8):
+        step, state = ours.step_and_maybe_reset(state.set("action", action))
+        expected, expected_state = EnvBase.step_and_maybe_reset(torchrls, expected_state.set("action", action))
+        assert_identical(step, expected)
+        assert_identical(state.exclude("action"), expected_state.exclude("action"))  # zeros where episodes begin
+        num_ended += step["next", "done"].sum()
+    assert num_ended > 16
+
+
+def test_an_outcome_that_the_caller_prescribes_is_kept():
+    env = make()
+    start = env.reset().set("action", torch.zeros(4, 8)).set("next", TensorDict({"note": torch.ones(4)}, [4]))
+    step, _ = env.step_and_maybe_reset(start)
+    assert torch.equal(step["next", "note"], torch.ones(4))
 
 
 def test_what_was_emitted_does_not_change_later():

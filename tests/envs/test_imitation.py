@@ -218,10 +218,10 @@ def test_where_references_are_lost_they_come_back_more_often():
     env = make(num_envs=3000, clips=clips, failure_weighting=0.6)
     env.reset()
     assert (env.episode["clip"] == 0).double().mean().item() == pytest.approx(2 / 5, abs=0.04)
-    difficulty = env._sampler
+    sampler = env._sampler
     for step in range(2000):  # seconds 0 and 1 of the first, 0 to 2 of the second, whose last is lost every fifth time
         clip, time = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0.5, 7.5, 0.5, 1.5, 2.5]).double()
-        difficulty.count(clip, time, torch.tensor([False, False, False, False, step % 5 == 0]))
+        sampler.count(clip, time, torch.tensor([False, False, False, False, step % 5 == 0]))
     env.reset()
     hard = (env.episode["clip"] == 1) & (env.episode["time"] >= 1.0)
     assert hard.double().mean().item() == pytest.approx(0.4 * 2 / 5 + 0.6 * 0.95, abs=0.06)

@@ -10,7 +10,7 @@ from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rendering import arrow
-from torchrl_mcp.envs.scenery import reach, scenery, softly_lit
+from torchrl_mcp.envs.scenery import extent, scenery, softly_lit
 
 
 def turn():
@@ -119,7 +119,7 @@ def test_the_reach_is_that_of_the_furthest_shape_of_the_first_body_alone():
           </body>
           <body pos="-9 0 1"><freejoint/><geom size="1"/></body>
         </worldbody></mujoco>""")
-    assert math.isclose(reach(model), 0.6 + 0.1, abs_tol=1e-6)  # the centre of mass is at 0
+    assert math.isclose(extent(model), 0.6 + 0.1, abs_tol=1e-6)  # the centre of mass is at 0
 
 
 def test_softly_lit_ground_is_pale_and_endless_and_mirrors_nothing():

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal
 
 from torchrl_mcp.envs import Holdout
-from torchrl_mcp.evaluation.rollout import Evaluation, evaluate, summary
+from torchrl_mcp.evaluation.rollout import Evaluation, episode_statistics, evaluate
 
 
 class Countdown(EnvBase):
@@ -166,10 +166,10 @@ class Measured(Countdown):
 
 def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
     outcome = evaluate(IDLE, Measured([1, 2, 5]))
-    assert outcome.measures["success"].tolist() == [False, True, True]
-    assert outcome.measures["up"].tolist() == [1.0, 1.5, 3.0]
+    assert outcome.metrics["success"].tolist() == [False, True, True]
+    assert outcome.metrics["up"].tolist() == [1.0, 1.5, 3.0]
     expected = {"success": 2 / 3, "up": 5.5 / 3, "down": -5.5 / 3}
-    assert summary(outcome, lambda returns: returns)["measures"] == pytest.approx(expected)
+    assert episode_statistics(outcome, lambda returns: returns)["metrics"] == pytest.approx(expected)
 
 
 def test_what_the_policy_wrote_in_every_step_of_every_episode_is_recorded():
@@ -183,12 +183,12 @@ def test_what_the_policy_wrote_in_every_step_of_every_episode_is_recorded():
     assert "action" not in decisions.keys()  # noqa: SIM118
 
 
-def test_a_summary_of_four_episodes_by_hand():
+def test_the_statistics_of_four_episodes_by_hand():
     outcome = episodes([0.0, 2.0, 4.0, 6.0], [1, 2, 3, 10], [True, False, False, False])
-    numbers = summary(outcome, lambda returns: returns / 10)
+    numbers = episode_statistics(outcome, lambda returns: returns / 10)
     low, high = numbers.pop("interval")
     assert 0 <= low < 0.3 < high <= 0.6
-    assert numbers.pop("measures") == {}
+    assert numbers.pop("metrics") == {}
     assert numbers == pytest.approx(
         {
             "normalised_return": 0.3,
@@ -203,9 +203,9 @@ def test_a_summary_of_four_episodes_by_hand():
 
 def test_the_interval_is_that_of_normal_theory_for_many_episodes():
     returns = 5 + 2 * torch.randn(400, generator=torch.Generator().manual_seed(0))
-    low, high = summary(episodes(returns), lambda x: x, resamples=10_000)["interval"]
+    low, high = episode_statistics(episodes(returns), lambda x: x)["interval"]
     half = 1.96 * returns.std().item() / math.sqrt(400)
-    # Of 10000 resamples the 2.5 % quantile has a standard error of about 0.027 standard errors of the mean.
+    # Of 9999 resamples the 2.5 % quantile has a standard error of about 0.027 standard errors of the mean.
     assert low == pytest.approx(returns.mean().item() - half, abs=0.08 * half)
     assert high == pytest.approx(returns.mean().item() + half, abs=0.08 * half)
 
@@ -214,24 +214,24 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     generator = torch.Generator().manual_seed(0)
     covered = 0
     for _ in range(200):
-        low, high = summary(episodes(torch.randn(64, generator=generator)), lambda x: x, resamples=500)["interval"]
+        low, high = episode_statistics(episodes(torch.randn(64, generator=generator)), lambda x: x)["interval"]
         covered += low <= 0 <= high
     # 95 % of 200 is 190, with a standard deviation of 3
     assert 180 <= covered <= 199
 
 
-def test_the_summary_repeats_and_leaves_the_global_generator_alone():
+def test_the_statistics_repeat_and_leave_the_global_generator_alone():
     outcome = episodes(torch.randn(20))
     state = torch.get_rng_state()
-    assert summary(outcome, lambda x: x) == summary(outcome, lambda x: x)
+    assert episode_statistics(outcome, lambda x: x) == episode_statistics(outcome, lambda x: x)
     assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_equal_episodes_have_an_interval_without_width():
-    assert summary(episodes([3.0] * 10), lambda x: x)["interval"] == [3.0, 3.0]
+    assert episode_statistics(episodes([3.0] * 10), lambda x: x)["interval"] == [3.0, 3.0]
 
 
 def test_a_single_episode_has_no_spread():
-    numbers = summary(episodes([3.0]), lambda x: x)
+    numbers = episode_statistics(episodes([3.0]), lambda x: x)
     assert (numbers["normalised_return"], numbers["normalised_return_std"]) == (3.0, 0.0)
     assert numbers["interval"] == [3.0, 3.0]

@@ -14,9 +14,9 @@ BIPED = ["character=biped", "task=imitation"]
 SMALL = {
     "option_critic": ["parts.options.trunk_cells=[16]", "parts.terminations.num_cells=[16]", "parts.values_cells=[16]"],
     "hierarchical": [
-        "primitives.network.policy.num_cells=[16]",
-        "gating.network.num_cells=[16]",
-        "critic.num_cells=[16]",
+        "+primitives.network.policy.num_cells=[16]",
+        "+gating.network.num_cells=[16]",
+        "+critic.num_cells=[16]",
     ],
 }
 

@@ -140,6 +140,16 @@ def test_frozen_options_leave_the_values_alone_to_learn():
     assert list(report.keys()) == loss.out_keys == ["loss_critic"]
 
 
+def test_without_a_critic_the_terms_of_the_options_are_left():
+    options = Options()
+    samples, whole = exact_samples(Problem(), options, 0), tabular_loss(options)
+    loss = OptionCriticLoss(whole.actor_network, None, clip_epsilon=0.2, bound_coeff=0.0)
+    report, expected = loss(samples), whole(samples)
+    assert list(report.keys()) == loss.out_keys == [key for key in whole.out_keys if key != "loss_critic"]
+    for key, value in report.items():
+        assert torch.equal(value, expected[key]), key
+
+
 def test_it_is_called_with_tensors_by_name_as_well():
     options = Options()
     samples, loss = exact_samples(Problem(), options, 0), tabular_loss(options)

@@ -12,7 +12,7 @@ def numbers(value, diagnostics):
     """What an evaluation says of one mode."""
     interval = [value - 0.02, value + 0.02]
     episodes = {"return": 600 * value, "length": 450.0, "terminated": 0.25, "episodes": 128}
-    return {"normalised_return": value, "interval": interval, "measures": {}, "diagnostics": diagnostics} | episodes
+    return {"normalised_return": value, "interval": interval, "metrics": {}, "diagnostics": diagnostics} | episodes
 
 
 PAPERS_MCP = {

@@ -2,8 +2,9 @@ import math
 
 import pytest
 
-from torchrl_mcp.report.comparison import ablations, caveats, cells, over_tasks
+from torchrl_mcp.report.comparison import ablations, caveats, cells, methods, over_tasks
 from torchrl_mcp.report.results import read_run
+from torchrl_mcp.report.sections import method_colours, row
 
 
 def grouped(*folders):
@@ -86,7 +87,6 @@ def test_what_a_choice_brings_along_goes_without_saying(write_run):
         {"device": "cuda"},
         {"pretrained": "runs/other"},
         {"logger__name": "csv"},
-        {"task__fast__num_envs": 3},
         {"task__pretrain__speed": 2.0},
         {"evaluation__episodes": 3},
         {"added_later": 1},
@@ -98,6 +98,13 @@ def test_what_changes_no_learning_parts_no_seeds(write_run, setting):
     before = {} if name == "added_later" else {name: None}
     (cell,) = grouped(write_run("a", **before), write_run("b", seed=1, **setting))
     assert len(cell.runs) == 2
+
+
+def test_an_argument_that_only_some_runs_name_tells_them_apart(write_run):
+    made = {"task__transfer___target_": "torchrl_mcp.envs.Heading"}
+    found = grouped(write_run("a", **made), write_run("b", seed=1, **made, task__transfer__max_turn=0.3))
+    told = {cell.runs[0].seed: cell.settings for cell in found}
+    assert told == {0: {"task.transfer.max_turn": "default"}, 1: {"task.transfer.max_turn": 0.3}}
 
 
 def test_only_complete_runs_count_and_the_others_are_remarked(write_run):
@@ -163,6 +170,23 @@ def test_the_gap_is_our_mean_less_the_papers(write_mcp):
 def test_the_paper_has_no_figure_for_what_it_did_not_measure(write_mcp, settings):
     (cell,) = grouped(write_mcp("a", score=0.5, **settings))
     assert (cell.reported, cell.gap) == (None, None)
+
+
+def test_a_method_of_your_own_is_known_by_the_title_and_the_settings_that_it_tells(write_run):
+    about = {"method": "mine", "method__title": "My Own", "method__standard": {"top": 3}}
+    variant, standard = grouped(write_run("a", top=2, **about), write_run("b", top=3, **about))
+    if variant.is_standard:
+        variant, standard = standard, variant
+    assert (standard.title, standard.is_standard, variant.is_standard) == ("My Own", True, False)
+    assert (row(standard).label, row(variant).label) == ("My Own", "My Own, top=2")
+
+
+def test_methods_have_colours_of_their_own_those_of_table_2_first(write_run):
+    names = ["mine", "mcp", "scratch", "hers"]
+    found = grouped(*(write_run(name, method=name) for name in names))
+    assert methods(found) == {"scratch": "Scratch", "mcp": "MCP", "hers": "hers", "mine": "mine"}
+    assert list(method_colours(found)) == ["scratch", "mcp", "hers", "mine"]
+    assert len(set(method_colours(found).values())) == 4
 
 
 @pytest.mark.parametrize(

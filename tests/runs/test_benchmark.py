@@ -11,8 +11,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import experiment
-from torchrl_mcp.runs import benchmark
+from torchrl_mcp.runs import benchmark, experiment
 
 BENCHMARKS = Path(conf.__file__).parent / "benchmark"
 CHARACTERS = {"ant", "biped", "humanoid", "trex"}
@@ -54,7 +53,7 @@ def smoke(root, *arguments):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    root = tmp_path_factory.mktemp("sweep") / "runs"
+    root = tmp_path_factory.mktemp("benchmark") / "runs"
     smoke(root)
     return root
 
@@ -90,11 +89,11 @@ def times(root):
 
 
 def test_table_2_has_exactly_the_cells_of_the_paper():
-    benchmark = OmegaConf.to_container(OmegaConf.load(BENCHMARKS / "table2.yaml"))
-    cells = [(c["task"], c["character"], c["method"]) for c in benchmark.expand(benchmark["rows"], {})]
+    table = OmegaConf.to_container(OmegaConf.load(BENCHMARKS / "table2.yaml"))
+    cells = [(c["task"], c["character"], c["method"]) for c in benchmark.expand(table["rows"], {})]
     paper = [(*row, m) for row, marks in TABLE_2.items() for m, mark in zip(METHODS, marks, strict=True) if mark == "1"]
     assert sorted(cells) == sorted(paper)
-    assert benchmark["params"] == {"seed": "0,1,2"}
+    assert table["params"] == {"seed": "0,1,2"}
 
 
 def test_the_tasks_of_a_character_share_the_pretraining_of_their_method_and_seed(tmp_path):
@@ -174,6 +173,8 @@ def test_what_concerns_the_task_of_transfer_is_kept_from_pretraining():
     expected = {"method": "mcp", "task": "imitation", "stage": "pretrain"}
     assert benchmark.pretraining_of(settings, task) == expected
     ant = {"name": "holdout", "pretrain": {}, "transfer": {}}
+    added = {"method": "mcp", "task": "carry", "+task.transfer.success_reward": "true"}
+    assert benchmark.pretraining_of(added, task) == expected
     settings = {"task": "holdout", "task.pretrain.max_episode_steps": "50"}
     assert benchmark.pretraining_of(settings, ant) == {**settings, "stage": "pretrain"}
 
@@ -184,7 +185,7 @@ def test_arguments_that_fit_no_row_are_refused_with_the_rows(tmp_path):
     assert "task=carry character=ant" in str(error.value)
 
 
-def test_settings_that_folders_do_not_tell_apart_are_not_swept(tmp_path):
+def test_settings_that_folders_do_not_tell_apart_are_not_varied(tmp_path):
     with pytest.raises(ValueError, match="autocast, would share the folder"):
         jobs_of("benchmark=smoke", f"run_root={tmp_path}", "method=scratch", "autocast=true,false")
 

@@ -4,10 +4,8 @@ from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build
-from torchrl_mcp.runs import builtin
+from torchrl_mcp.runs import build, builtin, experiment
 from torchrl_mcp.training import checkpoint
-from torchrl_mcp.runs import experiment
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]
@@ -52,7 +50,7 @@ def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16
 
 def test_a_published_policy_is_a_small_part_of_the_checkpoint_and_names_no_folder(run, published):
     assert published.stat().st_size < checkpoint.find(run).stat().st_size / 8
-    assert str(run.parent) not in str(checkpoint.configuration(published))
+    assert str(run.parent) not in str(checkpoint.saved_config(published))
 
 
 def test_primitives_are_transferred_from_what_comes_with_the_library(run, published, tmp_path, monkeypatch):
@@ -101,4 +99,4 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
 def test_what_comes_with_the_library_follows_its_motions(path):
     results = experiment.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25
-    assert results["deterministic"]["measures"]["tracking_error"] < 0.15
+    assert results["deterministic"]["metrics"]["tracking_error"] < 0.15

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,11 +11,12 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from torch import nn
 
 from torchrl_mcp import conf
-from torchrl_mcp.cli import evaluate
-from torchrl_mcp.runs import experiment
-from torchrl_mcp.cli import train
+from torchrl_mcp.cli import evaluate, train
+from torchrl_mcp.runs import benchmark, experiment
+from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
@@ -22,7 +24,7 @@ CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
 
 def command(name, *arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", f"torchrl_mcp.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
+        [sys.executable, "-m", f"torchrl_mcp.cli.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
     )
 
 
@@ -189,14 +191,54 @@ def test_a_run_that_is_to_go_on_loses_its_evaluation_and_gets_another(evaluated,
     assert (copy / "evaluation.json").read_text() != (evaluated / "evaluation.json").read_text()
 
 
-def test_a_run_of_before_there_were_evaluations_is_evaluated_as_a_new_one(evaluated, tmp_path):
-    cfg = OmegaConf.load(evaluated / "config.yaml")
-    del cfg["evaluation"]
-    OmegaConf.save(cfg, tmp_path / "config.yaml")
-    usual = {"episodes": 128, "seed": 12345, "environment": {}}
-    assert experiment.configuration(tmp_path).evaluation == usual
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):  # as on the command line
-        assert experiment.configuration(tmp_path).evaluation == usual
+def of_another_version(evaluated, folder):
+    """A copy of the run as a version wrote it that had another name for a function, and one of its checkpoints."""
+    shutil.copytree(evaluated, folder)
+    cfg = OmegaConf.load(folder / "config.yaml")
+    cfg.parts["_target_"] = "torchrl_mcp.actors.composite_parts"
+    OmegaConf.save(cfg, folder / "config.yaml")
+    config = OmegaConf.to_container(cfg)
+    file = folder / "old.torchrl"
+    run_checkpoint(nn.ModuleDict({"policy": nn.Linear(1, 1)})).save(file, metadata={"config": config})
+    return folder, file
+
+
+def test_a_run_of_another_version_is_refused_with_the_name_it_misses_and_the_remedy(evaluated, tmp_path):
+    folder, file = of_another_version(evaluated, tmp_path / "run")
+    before = contents(folder)
+    readers = [
+        (folder / "config.yaml", lambda: experiment.resume(folder)),
+        (folder / "config.yaml", lambda: experiment.is_complete(folder)),
+        (file, lambda: experiment.restore(file, num_envs=1, seed=0)),
+        (file, lambda: experiment.evaluation(file, episodes=1, seed=0)),
+    ]
+    for source, read in readers:
+        with pytest.raises(ValueError, match=re.escape(f"{source} is of another version of torchrl-mcp")) as refusal:
+            read()
+        assert "torchrl_mcp.actors.composite_parts" in str(refusal.value)
+        assert "origin.json" in str(refusal.value)
+    assert contents(folder) == before
+
+
+def test_a_benchmark_does_not_touch_runs_of_another_version(evaluated, tmp_path):
+    folder, _ = of_another_version(evaluated, tmp_path / "run")
+    job = benchmark.Job(folder, [], {})
+    with pytest.raises(ValueError, match="is of another version"):
+        benchmark.conflict(job)
+
+
+def test_a_run_of_before_methods_told_about_themselves_is_completed_with_its_own_networks(tmp_path):
+    cfg = configure("method=mcp", "num_primitives=4", "gating=softmax")
+    expected = OmegaConf.to_container(cfg, resolve=True)["method"]
+    del cfg.method
+    cfg.method = {"name": "mcp"}
+    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
+    found = OmegaConf.to_container(experiment.configuration(tmp_path), resolve=True)["method"]
+    assert (found["title"], found["standard"], found["explorer"]) == tuple(
+        expected[key] for key in ("title", "standard", "explorer")
+    )
+    assert found["explorer"]["num_primitives"] == 4
+    assert found["explorer"]["gate_activation"]["_target_"] == "torch.nn.Softmax"
 
 
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from torchrl_mcp import __version__
-from torchrl_mcp.runs import provenance
+from torchrl_mcp.runs import build, provenance
 from torchrl_mcp.training.precision import Precision
 
 
@@ -48,9 +48,11 @@ def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tm
     assert provenance.commit(tmp_path_factory.mktemp("elsewhere")) is None
 
 
-def test_the_origin_names_command_code_time_and_machine(monkeypatch):
+def test_provenance_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
-    content = json.loads(json.dumps(provenance.origin("cpu", Precision(True, "as measured"))))
+    command, choices = build.launched()
+    where_from = provenance.provenance("cpu", command, choices, Precision(True, "as measured"))
+    content = json.loads(json.dumps(where_from))
     assert content["command"] == ["script.py", "seed=3"]
     assert content["precision"] == "networks in bfloat16: as measured"
     assert content["version"] == __version__
@@ -68,8 +70,6 @@ def test_within_hydra_command_and_choices_are_those_of_the_job(monkeypatch):
             "runtime": {"choices": {"preset": "fast", "hydra/launcher": "basic", "benchmark": None}},
         }
     )
-    monkeypatch.setattr(provenance.HydraConfig, "initialized", lambda: True)
-    monkeypatch.setattr(provenance.HydraConfig, "get", lambda: hydra)
-    content = json.loads(json.dumps(provenance.origin("cpu", Precision(False, "autocast=false"))))
-    assert content["command"] == ["torchrl-mcp-train", "preset=fast", "seed=1"]
-    assert content["choices"] == {"preset": "fast"}
+    monkeypatch.setattr(build.HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(build.HydraConfig, "get", lambda: hydra)
+    assert build.launched() == (["torchrl-mcp-train", "preset=fast", "seed=1"], {"preset": "fast"})

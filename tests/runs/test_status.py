@@ -5,7 +5,11 @@ import sys
 import pytest
 from rich.console import Console
 
+<<<<<<< HEAD
 from torchrl_mcp.runs import lock, status
+=======
+from torchrl_mcp.cli.status import main
+>>>>>>> layout
 from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
@@ -76,7 +80,7 @@ def test_the_table_shows_what_runs_first_and_counts_what_it_leaves_out(runs):
 
 
 def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkeypatch):
-    monkeypatch.setattr(status, "INTERVAL", 0.01)
+    monkeypatch.setattr("torchrl_mcp.runs.status.INTERVAL", 0.01)
     with overview(runs, {runs / name: 1000 for name in ("alive", "later")}):
         make_run(runs / "later", frames=1000, evaluation=0.5)
     lines = capsys.readouterr().out.splitlines()
@@ -89,11 +93,11 @@ def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkey
 
 def test_the_command_shows_a_folder(runs, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", str(runs)])
-    status.main()
+    main()
     assert "1 running, 1 stopped, 1 done, 1 waiting" in capsys.readouterr().out
 
 
 def test_a_folder_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", "nowhere"])
     with pytest.raises(SystemExit, match="no folder nowhere"):
-        status.main()
+        main()

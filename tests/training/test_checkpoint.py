@@ -13,7 +13,7 @@ from tensordict import NonTensorData, NonTensorStack
 from torch import nn
 
 from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.training.checkpoint import configuration, find, load, load_parts, rotation, run_checkpoint
+from torchrl_mcp.training.checkpoint import find, load, load_parts, rotation, run_checkpoint, saved_config
 
 CONFIG = {"method": {"name": "mcp"}, "seed": 3}
 PREFIX = "components/0000-part-gating"
@@ -130,7 +130,7 @@ def test_where_there_is_no_checkpoint_that_is_said(run, place):
 
 
 def test_a_checkpoint_tells_the_configuration_that_wrote_it(run):
-    assert configuration(find(run)) == CONFIG
+    assert saved_config(find(run)) == CONFIG
 
 
 def truncate(data, share):
@@ -213,9 +213,9 @@ def test_a_missing_file_is_refused_and_not_created(run):
 def test_what_is_no_checkpoint_tells_no_configuration(tmp_path, content):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(ValueError, match=r"is not a checkpoint of torchrl-mcp"):
-        configuration(tmp_path / "file")
+        saved_config(tmp_path / "file")
     with pytest.raises(ValueError, match=r"is not a checkpoint of torchrl-mcp"):
-        configuration(tmp_path / "absent")
+        saved_config(tmp_path / "absent")
 
 
 def test_a_flipped_bit_anywhere_is_refused_or_without_effect(run):
@@ -255,7 +255,7 @@ def test_saving_and_loading_never_unpickles(run, without_pickle):
     restored = make(2)
     load(run_checkpoint(restored, optimizer=torch.optim.Adam(restored.parameters())), run / "file")
     assert same(components(restored), components(parts))
-    assert configuration(run / "file") == CONFIG
+    assert saved_config(run / "file") == CONFIG
 
 
 class Malice:

@@ -47,7 +47,7 @@ def numbers(row):
 
 def restored(folder):
     """The trainer of a run, at its newest checkpoint."""
-    cfg = experiment.configuration(folder)
+    cfg = experiment.run_config(folder)
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, folder)
     trainer.restore(checkpoint.find(folder))
@@ -97,7 +97,7 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
 
 def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):
     cfg = configure(tmp_path, "method=option_critic")
-    source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2)
+    source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2, num_threads=1)
     policy, watch = build.make_agent(cfg, source.env).actor.policy, Stopwatch()
     source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=False, stopwatch=watch)
     batch = source.collect()
@@ -112,10 +112,10 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
 
 def test_environments_that_do_not_divide_evenly_are_refused():
     with pytest.raises(ValueError, match="num_envs=5 must be a multiple of num_workers=2"):
-        RemoteSource(Holdout, num_envs=5, seed=0, num_workers=2)
+        RemoteSource(Holdout, num_envs=5, seed=0, num_workers=2, num_threads=1)
 
 
 def test_a_missing_ray_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setattr(collectors, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl-mcp\[ray\]'"):
-        RemoteSource(Holdout, num_envs=4, seed=0, num_workers=2, backend="ray")
+        RemoteSource(Holdout, num_envs=4, seed=0, num_workers=2, num_threads=1, backend="ray")

@@ -22,19 +22,19 @@ def table(folder):
 
 
 def fill(folder, iterations):
-    record = MetricsWriter(folder)
+    writer = MetricsWriter(folder)
     for i in iterations:
-        record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
-    return record
+        writer.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+    return writer
 
 
 def test_every_row_has_the_names_of_the_first(tmp_path):
-    record = MetricsWriter(tmp_path)
-    record.write({"iteration": 1, "loss": 0.1}, step=100)
-    record.write({"loss": math.nan, "iteration": 2}, step=200)
+    writer = MetricsWriter(tmp_path)
+    writer.write({"iteration": 1, "loss": 0.1}, step=100)
+    writer.write({"loss": math.nan, "iteration": 2}, step=200)
     assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,loss", "1,0.1", "2,nan"]
     with pytest.raises(ValueError, match="surprise"):
-        record.write({"iteration": 3, "loss": 0.1, "surprise": 1.0}, step=300)
+        writer.write({"iteration": 3, "loss": 0.1, "surprise": 1.0}, step=300)
 
 
 def test_numbers_survive_the_file_to_the_bit(tmp_path):
@@ -45,9 +45,9 @@ def test_numbers_survive_the_file_to_the_bit(tmp_path):
 
 def test_loggers_get_every_metric_that_is_a_number(tmp_path):
     loggers = [Recorder(), Recorder()]
-    record = MetricsWriter(tmp_path, loggers)
-    record.write({"iteration": 1, "return": math.nan, "loss": 0.1}, step=100)
-    record.write({"iteration": 2, "return": 7.0, "loss": math.inf}, step=200)
+    writer = MetricsWriter(tmp_path, loggers)
+    writer.write({"iteration": 1, "return": math.nan, "loss": 0.1}, step=100)
+    writer.write({"iteration": 2, "return": 7.0, "loss": math.inf}, step=200)
     for logger in loggers:
         assert logger.calls == [
             ({"iteration": 1, "loss": 0.1}, 100),
@@ -58,10 +58,10 @@ def test_loggers_get_every_metric_that_is_a_number(tmp_path):
 def test_rewinding_drops_what_came_after_the_checkpoint(tmp_path):
     fill(tmp_path, range(1, 13))
     before = table(tmp_path)
-    record = MetricsWriter(tmp_path)
-    record.rewind(10)
+    writer = MetricsWriter(tmp_path)
+    writer.rewind(10)
     assert table(tmp_path) == before[:10]
-    record.write({"iteration": 11, "frames": 1, "loss": 2.0}, step=1)
+    writer.write({"iteration": 11, "frames": 1, "loss": 2.0}, step=1)
     assert table(tmp_path) == [*before[:10], {"iteration": "11", "frames": "1", "loss": "2.0"}]
 
 
@@ -72,11 +72,11 @@ def test_wherever_a_kill_cuts_the_file_a_continued_run_writes_a_whole_one(tmp_pa
     safe = whole.index(b"10,1000")  # the checkpoint of iteration 9 is younger than its row
     for cut in range(safe, len(whole)):
         file.write_bytes(whole[:cut])
-        record = MetricsWriter(tmp_path)
-        record.rewind(9)
+        writer = MetricsWriter(tmp_path)
+        writer.rewind(9)
         assert table(tmp_path) == expected[:2], cut
         for i in (10, 11):
-            record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+            writer.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
         assert table(tmp_path) == expected, cut
         assert file.read_bytes() == whole, cut
 
@@ -104,16 +104,16 @@ def test_a_header_that_a_kill_cut_short_is_written_anew(tmp_path):
     whole = file.read_bytes()
     for cut in range(whole.index(b"1,100")):
         file.write_bytes(whole[:cut])
-        record = MetricsWriter(tmp_path)
-        record.rewind(0)
+        writer = MetricsWriter(tmp_path)
+        writer.rewind(0)
         for i in (1, 2):
-            record.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
+            writer.write({"iteration": i, "frames": 100 * i, "loss": i / 3}, step=100 * i)
         assert file.read_bytes() == whole, cut
 
 
 def test_rewinding_before_anything_was_written_does_nothing(tmp_path):
-    record = MetricsWriter(tmp_path)
-    record.rewind(5)
+    writer = MetricsWriter(tmp_path)
+    writer.rewind(5)
     assert not (tmp_path / "metrics.csv").exists()
-    record.write({"iteration": 1}, step=1)
+    writer.write({"iteration": 1}, step=1)
     assert table(tmp_path) == [{"iteration": "1"}]

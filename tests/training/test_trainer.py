@@ -13,7 +13,9 @@ from hydra import compose, initialize_config_module
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.training.trainer import Trainer, checkpoint
+from torchrl_mcp.training import checkpoint, trainer
+from torchrl_mcp.training.threads import threads
+from torchrl_mcp.training.trainer import Trainer
 
 TIMES = ("seconds", "time/")
 
@@ -159,6 +161,26 @@ def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all
     finally:
         torch.set_num_threads(before)
     assert threads == {"step": {1}, "update": {2}}
+
+
+@pytest.mark.parametrize("method", ["mcp", "option_critic"])
+def test_actor_and_critic_learn_the_same_at_the_same_time_as_in_turn_to_the_bit(tmp_path, monkeypatch, method):
+    settings = [f"method={method}", "torch_threads=2", "training.total_frames=256"]
+    with threads(2):
+        experiment.train(configure(tmp_path / "together", *settings))
+        with monkeypatch.context() as patch:
+            patch.setattr(trainer, "side_by_side", in_turn)
+            experiment.train(configure(tmp_path / "in_turn", *settings))
+    assert rows(tmp_path / "together") == rows(tmp_path / "in_turn")
+    expected = final_parts(tmp_path / "in_turn")
+    for name, value in final_parts(tmp_path / "together").items():
+        assert torch.equal(value, expected[name]), name
+
+
+def in_turn(tasks):
+    assert list(tasks) == ["actor", "critic"]
+    with threads(1):
+        return {name: task() for name, task in tasks.items()}
 
 
 def test_the_shares_of_time_add_up_to_the_whole(pretrained):

@@ -32,6 +32,13 @@ def test_bars_are_as_long_as_their_weights(height):
         assert abs(length(pixels, colour) - weight * full) <= 1
 
 
+def test_eight_bars_have_eight_colours():
+    pixels = drawn([1.0] * 8)
+    assert len(set(COLOURS)) >= 8
+    areas = [len(where(pixels, colour)[0]) for colour in COLOURS[:8]]
+    assert areas == pytest.approx([areas[0]] * 8, rel=0.05)  # a few pixels of the text are black, too
+
+
 def test_bars_follow_one_another_from_above_and_start_together():
     pixels = drawn([0.3, 0.9, 0.6])
     rows, columns = zip(*(where(pixels, colour) for colour in COLOURS[:3]), strict=True)
@@ -57,3 +64,9 @@ def test_bars_stay_in_the_upper_left_corner():
     changed = np.nonzero((drawn([1.0] * 8) != 255).any(-1))
     assert changed[0].max() < 440 / 2
     assert changed[1].max() < 440 / 2
+
+
+def test_eight_primitives_have_eight_colours():
+    pixels = drawn([1.0] * 8)
+    assert len(set(COLOURS)) == 8
+    assert all(len(where(pixels, colour)[0]) > 0 for colour in COLOURS)

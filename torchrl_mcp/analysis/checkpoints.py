@@ -1,4 +1,4 @@
-"""What the paper's figures show, asked of checkpoints: how they walk, explore, and take directions."""
+"""Data of the paper's figures from checkpoints: walks, random exploration and trajectories by target direction."""
 
 import dataclasses
 import math
@@ -8,48 +8,23 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
-from torchrl_mcp.analysis.exploration import Explorer, RandomSequence, fixed_latent, fixed_weights
 from torchrl_mcp.analysis.holdout import Trajectories, play_directions
 from torchrl_mcp.analysis.walks import Walk, record_walk, specialisation
 from torchrl_mcp.envs import CharacterEnv, Heading, Imitation
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.single import single_motion
-from torchrl_mcp.methods.actor import PRIMITIVES
-from torchrl_mcp.methods.option_critic import acting_option
+from torchrl_mcp.methods.actor import PRIMITIVES, Explorer
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint
-
-EXPLORING = {
-    "mcp": "MCP, random weights",
-    "moe": "MOE, random weights",
-    "latent_space": "latent space, random latents",
-    "hierarchical": "hierarchical, random sequence",
-    "option_critic": "option-critic, random sequence",
-}
-"""Methods that have something to combine at random, and how to call that."""
-
-STEPS_PER_CHOICE = 30
-"""Control steps for which a primitive of a random sequence acts, about a walk cycle (appendix B)."""
 
 UNTRAINED = 10
 """Networks before training, whose mean numbers are put beside those of trained ones."""
 
 SPACING = math.radians(7.5)
 """Between the target directions of trajectories."""
-
-
-def configuration(path: Path) -> DictConfig:
-    """Return the configuration of a run folder's newest checkpoint, or of a checkpoint file.
-
-    Raises:
-        ValueError: If there is no checkpoint or it is damaged.
-    """
-    return OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
 
 
 def walk_of(
@@ -67,13 +42,14 @@ def walk_of(
     Raises:
         ValueError: If the run is of another task, has no weights of primitives, or cannot walk.
     """
-    cfg = configuration(path)
+    cfg = experiment.policy_config(path)
     if cfg.task.name != "imitation":
         raise ValueError(
             f"{path} is of task={cfg.task.name}: Figure 7 is of pre-training, give a run of task=imitation"
         )
-    if cfg.method.name not in ("mcp", "moe"):
-        raise ValueError(f"{path} is of method={cfg.method.name}, which has no weights: give a run of mcp or moe")
+    _, agent, _ = experiment.restore(path, num_envs=1, seed=seed)
+    if "gates" not in agent.actor.stored:
+        raise ValueError(f"{path} is of method={cfg.method.name}, which has no weights: give a run of one with gates")
     clips = single_motion(cfg.character.name, clip)
     cfg, agent, env = experiment.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
     walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
@@ -104,7 +80,7 @@ def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk
 
 
 def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Generator) -> Explorer:
-    """Return how a method explores at random, as in Section 5.3.
+    """Return the random explorer of a method, as in Section 5.3.
 
     Args:
         cfg: Its configuration.
@@ -113,33 +89,20 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
         generator: Source of randomness.
 
     Raises:
-        ValueError: If the method has nothing to combine.
+        ValueError: If the method has none.
     """
-    parts, method = agent.parts, cfg.method.name
-    match method:
-        case "mcp" | "moe":
-            # Paper: Gaussian weights. Here the logits are, as with exploration=weights: weights stay between 0 and 1.
-            logits = torch.randn(num, cfg.num_primitives, generator=generator)
-            gates = instantiate(cfg.gating.activation)(logits)
-            return fixed_weights(parts["primitives"], instantiate(cfg.mixer.distribution_class), gates)
-        case "latent_space":
-            return fixed_latent(parts["decoder"], torch.randn(num, cfg.latent_dim, generator=generator))
-        case "hierarchical":
-            return RandomSequence(
-                parts["primitives"], num_options=cfg.num_primitives, steps=STEPS_PER_CHOICE, generator=generator
-            )
-        case "option_critic":
+    if cfg.method.explorer is None:
+        raise ValueError(
+            f"method={cfg.method.name} has nothing to combine at random: give checkpoints of methods that have a "
+            "method.explorer, such as mcp; noise on actions, with which scratch begins, is drawn in any case"
+        )
+    return build.instantiate(cfg.method.explorer)(agent.parts, num, generator)
 
-            def options(state: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
-                loc, scale = parts["options"](state)
-                return acting_option(loc, scale, option)
 
-            return RandomSequence(options, num_options=cfg.num_options, steps=STEPS_PER_CHOICE, generator=generator)
-        case _:
-            raise ValueError(
-                f"method={method} has nothing to combine at random: give checkpoints of {', '.join(EXPLORING)}; "
-                "noise on actions, with which scratch begins, is drawn in any case"
-            )
+def explorer_title(cfg: DictConfig) -> str:
+    """Return a method's title and the name of the function that makes its explorer, ``MCP, random weights``."""
+    function = cfg.method.explorer._target_.rpartition(".")[2]
+    return f"{cfg.method.title}, {function.replace('_', ' ')}"
 
 
 def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[CharacterEnv, TensorDictBase]:
@@ -177,7 +140,7 @@ def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
     Returns:
         Trajectories by a name that says when and where; of a run that is not over, that it is not.
     """
-    cfg, panels = configuration(path), {}
+    cfg, panels = experiment.policy_config(path), {}
     over = path.is_file() or checkpoint.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):

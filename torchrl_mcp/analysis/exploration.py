@@ -1,7 +1,4 @@
-"""Where characters go that explore at random: Figure 6.
-
-An *explorer* is a function from normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal.
-"""
+"""Paths of characters that explore at random: Figure 6."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,17 +11,14 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation.rollout import evaluate
-from torchrl_mcp.methods.actor import Composition
-from torchrl_mcp.methods.mcp import DeterministicAction
+from torchrl_mcp.methods.actor import Explorer
 
 Array = NDArray[np.float64]
-
-Explorer = Callable[[Tensor], Tensor]
 
 UPRIGHT, FALLEN = COLOURS[0], COLOURS[1]
 
@@ -34,7 +28,7 @@ SPACING = 0.2
 
 @dataclass(frozen=True)
 class Exploration:
-    """Where characters went that began alike.
+    """Paths of characters that began in the same state.
 
     Attributes:
         positions: Horizontal position of the root in metres from where it began, ``(T + 1, N, 2)``; NaN after the end.
@@ -52,62 +46,6 @@ class Exploration:
         steps = np.isfinite(self.positions[..., 0]).sum(0) - 1
         # The position of the last step of an episode is not known.
         return (steps + 1) * self.timestep
-
-
-def fixed_weights(primitives: nn.Module, mixer: Composition, gates: Tensor) -> Explorer:
-    """Compose primitives with weights that are held, and play the composite's deterministic action.
-
-    Args:
-        primitives: From states to means and standard deviations, each ``(N, K, A)``.
-        mixer: Of ``(loc, scale, gates)``.
-        gates: Weights, shape ``(N, K)``.
-    """
-    composite = DeterministicAction(mixer)
-
-    def act(state: Tensor) -> Tensor:
-        loc, scale = primitives(state)
-        return composite(loc, scale, gates)
-
-    return act
-
-
-def fixed_latent(decoder: nn.Module, latent: Tensor) -> Explorer:
-    """Decode a latent variable that is held, and play the mean action.
-
-    Args:
-        decoder: From states and latent variables to means and standard deviations, each ``(N, A)``.
-        latent: Shape ``(N, L)``.
-    """
-    return lambda state: decoder(state, latent)[0]
-
-
-class RandomSequence:
-    """Lets one primitive act after the other in random order, each for as many steps, and plays mean actions.
-
-    Args:
-        primitives: From states and the options that act, ``(N,)``, to means and standard deviations, each ``(N, A)``.
-        num_options: Number of primitives.
-        steps: For which one acts.
-        generator: Source of randomness.
-    """
-
-    def __init__(
-        self,
-        primitives: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-        *,
-        num_options: int,
-        steps: int,
-        generator: torch.Generator,
-    ) -> None:
-        self._primitives, self._num_options, self._steps, self._generator = primitives, num_options, steps, generator
-        self._elapsed, self._option = 0, torch.zeros(0, dtype=torch.int64)
-
-    def __call__(self, state: Tensor) -> Tensor:
-        """Return actions for the next step."""
-        if self._elapsed % self._steps == 0:
-            self._option = torch.randint(self._num_options, state.shape[:1], generator=self._generator)
-        self._elapsed += 1
-        return self._primitives(state, self._option)[0]
 
 
 def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> Explorer:
@@ -141,7 +79,7 @@ def explore(
     return Exploration(positions.numpy(), outcome.terminated.numpy(), env.control_timestep)
 
 
-def summary(exploration: Exploration) -> dict[str, float]:
+def path_statistics(exploration: Exploration) -> dict[str, float]:
     """Say how far exploration leads.
 
     ``upright`` is the share of characters that did not fall, ``seconds`` the median time until they did or the time was
@@ -205,7 +143,7 @@ def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure
 
 
 def _outcome(panel: Exploration) -> str:
-    numbers = summary(panel)
+    numbers = path_statistics(panel)
     return f"{numbers['upright']:.0%} upright, median {numbers['seconds']:.1f} s, reach {numbers['distance']:.1f} m"
 
 

@@ -1,5 +1,6 @@
-"""What all figures share: a plain look, colours that colour-blind readers can tell apart, and the files."""
+"""The plain look of all figures, a palette for colour-blind readers, and the writing of files."""
 
+from itertools import cycle, islice
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -8,8 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-# Okabe and Ito, "Color Universal Design", 2008, https://jfly.uni-koeln.de/color/, darkest contrasts first.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+# Okabe and Ito, "Color Universal Design", 2008, https://jfly.uni-koeln.de/color/, darkest contrasts first, and grey.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
 
 # A cycle for angles. Orange opposes blue and dark opposes light, which every kind of colour vision keeps apart. Unlike
 # in matplotlib's own cycles nothing is too light for lines on white. The held-out quarter has the strongest contrast.
@@ -20,6 +21,11 @@ DIRECTIONS = LinearSegmentedColormap.from_list(
 
 INK = "#333333"
 FAINT = "#DDDDDD"
+
+
+def colours(num: int) -> list[str]:
+    """Return colours for a number of things, such as primitives; they repeat after the eighth."""
+    return list(islice(cycle(COLOURS), num))
 
 
 def new_figure(width: float, height: float) -> Figure:

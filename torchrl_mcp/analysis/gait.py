@@ -1,4 +1,4 @@
-"""Strides and their phases, found from the feet on the ground and from nothing that a reference motion says."""
+"""Strides and their phases, found from the feet on the ground alone, without the reference motion."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ STEADY = 7
 
 
 class Feet:
-    """Tells which feet of characters stand on the ground.
+    """A detector of the feet that stand on the ground.
 
     Args:
         env: The characters. Only shapes of their feet and how they lie are looked at.

@@ -1,4 +1,4 @@
-"""Where a character goes that is told where to go: trajectories by target direction, as in Figure 5 (right)."""
+"""Trajectories by target direction, as in Figure 5 (right)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
     A path has the colour of its target direction, which the mark of that colour on the outer ring shows: perfect paths
     are rays towards their marks.
     """
-    rings = _rings(max(_reach(panel) for panel in panels.values()))
+    rings = _rings(max(_greatest_distance(panel) for panel in panels.values()))
     figure = new_figure(3.3 * len(panels), 4.0)
     for column, (title, trajectories) in enumerate(panels.items(), start=1):
         axes = figure.add_subplot(1, len(panels), column)
@@ -86,7 +86,7 @@ def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
     return figure
 
 
-def _reach(trajectories: Trajectories) -> float:
+def _greatest_distance(trajectories: Trajectories) -> float:
     """Return the greatest distance from the origin, in metres."""
     return float(np.nanmax(np.linalg.norm(trajectories.positions, axis=-1), initial=0.0))
 

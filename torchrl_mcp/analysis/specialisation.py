@@ -1,4 +1,4 @@
-r"""Do primitives specialise? Numbers beside Figure 7: how weights follow the walk cycle, how far actions are apart.
+r"""Specialisation in numbers, beside Figure 7: how weights follow the walk cycle, how far actions are apart.
 
 Samples are rows; ``K`` counts primitives, ``A`` actions, ``M`` samples.
 """

@@ -1,19 +1,15 @@
 """Weights over the walk cycle and mean actions of primitives: Figure 7."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle, islice
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 
-from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
+from torchrl_mcp.analysis.figures import INK, bare, colours, new_figure
 from torchrl_mcp.analysis.specialisation import PHASE_BINS, stance_correlation
 from torchrl_mcp.analysis.walks import STATES, Walk, cycle_rows, plane, specialisation
-
-GREY = "#999999"
-"""The eighth colour, after those of all figures."""
 
 SHADE = "#EEEEEE"
 """Where the right foot stands alone."""
@@ -56,8 +52,8 @@ def _draw_weights(figure: SubFigure, walk: Walk) -> None:
     rows, cells = -(-num_primitives // 2), cycle_rows(walk)
     alone = [row for row in cells if row["primitive"] == 1 and row["right_foot"] > 0.5 >= row["left_foot"]]
     grid = figure.subplots(rows + 1, 2, sharex=True, squeeze=False, height_ratios=[1.0] * rows + [0.55])
-    colours, stance = _colours(num_primitives), stance_correlation(walk.gates, walk.standing)
-    for number, (axes, colour) in enumerate(zip(grid[:-1].T.flat, colours, strict=False), start=1):
+    palette, stance = colours(num_primitives), stance_correlation(walk.gates, walk.standing)
+    for number, (axes, colour) in enumerate(zip(grid[:-1].T.flat, palette, strict=False), start=1):
         own = [row for row in cells if row["primitive"] == number]
         phase, mean, low, high = (np.array([row[key] for row in own]) for key in ("phase", "mean", "low", "high"))
         axes.broken_barh(_spans(alone), (-0.04, 1.08), color=SHADE, linewidth=0)
@@ -99,7 +95,7 @@ def _spans(rows: Sequence[Mapping[str, float]]) -> list[tuple[float, float]]:
 def _draw_actions(figure: SubFigure, walk: Walk) -> None:
     axes = figure.subplots()
     scores, shares = plane(walk)
-    for number, colour in enumerate(_colours(scores.shape[1]), start=1):
+    for number, colour in enumerate(colours(scores.shape[1]), start=1):
         points = scores[:, number - 1]
         axes.scatter(points[:, 0], points[:, 1], s=6, color=colour, linewidths=0)
         # At the edge of the cloud that is away from the others: the origin is the mean of all.
@@ -123,7 +119,3 @@ def _draw_actions(figure: SubFigure, walk: Walk) -> None:
     axes.grid(color="#EEEEEE")
     axes.set_axisbelow(True)
     bare(axes)
-
-
-def _colours(num: int) -> list[str]:
-    return list(islice(cycle((*COLOURS, GREY)), num))

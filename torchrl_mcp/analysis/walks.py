@@ -1,4 +1,4 @@
-"""What gate and primitives do in a walk, and how far they specialise: the numbers of Figure 7."""
+"""Gates and primitives over a walk, and their specialisation: the numbers of Figure 7."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ GOLDEN = 0.6180339887498949
 
 @dataclass(frozen=True)
 class Walk:
-    """What a policy did in the complete strides of a walk, sample by sample.
+    """The samples of a policy in the complete strides of a walk.
 
     Attributes:
         phases: Of the stride, 0 where the right foot touches down, in [0, 1), ``(M,)``.

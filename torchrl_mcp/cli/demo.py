@@ -9,31 +9,31 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import torch
-from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_mcp import __version__, analysis
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.identity import PLACES, differences
 from torchrl_mcp.runs.processes import start, ticks
+from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.checkpoint import FOLDER
-from torchrl_mcp.training.run_folder import CONFIG
+from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
 
 Runs = Mapping[str, DictConfig]
 
 RUNS = {
     "pretrain": ["method=mcp", "stage=pretrain"],
     "transfer": ["method=mcp", "stage=transfer"],
-    "scratch": ["method=scratch", "stage=transfer"],
+    "scratch": ["method=scratch", "stage=transfer", "+parts.policy.num_cells=[512,256]"],
 }
 
 # Panels of the picture: title, run, and stage whose directions the ant is told to take.
@@ -53,7 +53,7 @@ CONTENTS = """\
 
 @dataclass(frozen=True)
 class Policy:
-    """A line of the table.
+    """A policy in the table of results.
 
     Attributes:
         label: What the table calls it.
@@ -73,7 +73,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="torchrl-mcp-demo", description=__doc__.partition("\n")[0])
     parser.add_argument("overrides", nargs="*", help="settings of all runs, as torchrl-mcp-train takes them: seed=1")
     parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
-    parser.add_argument("--smoke", action="store_true", help="take seconds, to show that everything runs")
+    parser.add_argument("--smoke", action="store_true", help="a test of the demonstration, which takes seconds")
     arguments = parser.parse_args()
     preset = "demo_smoke" if arguments.smoke else "demo"
     try:
@@ -91,7 +91,7 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
         ValueError: If the settings contradict each other or those of the folder, or a process fails.
     """
     began = time.monotonic()
-    runs = {name: configuration(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
+    runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
     runs["transfer"].pretrained = runs["pretrain"].run_dir
     require_early_checkpoint(runs)
     print(f"Working in {folder}. Interrupt it when you like: called again, it goes on from there.", flush=True)
@@ -101,22 +101,21 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     print(CONTENTS.format(folder=folder))
 
 
-def configuration(folder: Path, overrides: Sequence[str]) -> DictConfig:
+def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
     Raises:
         ValueError: If the folder holds a run with another one.
     """
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", list(overrides))
+    cfg = build.compose_run(*overrides)
     cfg.run_dir = str(folder)
     if not (folder / CONFIG).exists():
         return cfg
-    held = OmegaConf.load(folder / CONFIG)
-    if cfg.autocast == "auto":
-        cfg.autocast = held.autocast  # what the run found best
-    if _settings(held) != _settings(cfg):
+    held = experiment.run_config(folder)
+    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, cfg))
+    if differences(began, begins, PLACES):
         raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
+    cfg.autocast = held.autocast  # the precision that the run chose
     return cfg
 
 
@@ -127,7 +126,7 @@ def require_early_checkpoint(runs: Runs) -> None:
     if steps % between and steps != _steps(scratch):
         raise ValueError(
             f"transfer ends after {steps} steps, and scratch has no checkpoint there to compare with, only one every "
-            f"{between}: make demo.frames.mcp.transfer a multiple of that, or checkpoint_interval smaller"
+            f"{between}: make budget.transfer a multiple of that, or checkpoint_interval smaller"
         )
 
 
@@ -176,8 +175,7 @@ def evaluate(folder: Path, runs: Runs, name: str) -> None:
         return
     path, directions = policies(folder, runs)[name].path, cfg.task.directions.transfer
     results = experiment.evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
-    with replacing(file) as part:
-        part.write_text(json.dumps(results))
+    write_json(results, file)
 
 
 def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
@@ -192,8 +190,8 @@ def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
     _, agent, env = experiment.restore(
         Path(cfg.run_dir), num_envs=len(directions), seed=cfg.demo.seed, max_episode_steps=cfg.demo.paths.steps
     )
-    with replacing(file) as part:
-        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), part)
+    with replacing(file) as partial:
+        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), partial)
 
 
 def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
@@ -234,8 +232,9 @@ def report(folder: Path, runs: Runs) -> str:
         name: {"label": line.label, "steps": line.steps, "pretraining_steps": line.pretraining_steps, **results[name]}
         for name, line in lines.items()
     }
-    (folder / "results.md").write_text(table + "\n")
-    (folder / "results.json").write_text(json.dumps(details, indent=2) + "\n")
+    with replacing(folder / "results.md") as partial:
+        partial.write_text(table + "\n")
+    write_json(details, folder / "results.json")
     groups = {"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]}
     curves = analysis.learning_curves(groups, num_bins=20)
     analysis.write_curves(curves, folder / "learning_curves.csv")
@@ -256,33 +255,17 @@ def trajectory_file(folder: Path, name: str) -> Path:
     return folder / "trajectories" / f"{name}.npz"
 
 
-@contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Give a path to write to that becomes ``file`` when the block ends well: a file that exists is whole."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
-    yield part
-    part.replace(file)
-
-
 def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]]) -> str:
     """Return Markdown whose columns line up in a terminal."""
-    rows: list[tuple[str, ...]] = [("policy", "steps", "steps before", "deterministic", "stochastic")]
+    rows = []
     for name, line in lines.items():
-        cells = [
-            f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
-            for numbers in (results[name]["deterministic"], results[name]["stochastic"])
-        ]
-        rows.append((line.label, f"{line.steps:,}", f"{line.pretraining_steps:,}", *cells))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, tuple("-" * width for width in widths))
-    return "\n".join("| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows)
-
-
-def _settings(cfg: DictConfig | ListConfig) -> dict[str, Any]:
-    """All that makes a run what it is, wherever it lies."""
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    return {key: value for key, value in settings.items() if key not in ("run_dir", "pretrained")}
+        scores = {
+            mode: f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
+            for mode, numbers in results[name].items()
+        }
+        steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
+        rows.append({"policy": line.label, **steps, **scores})
+    return text_table(rows, markdown=True)
 
 
 def _steps(cfg: DictConfig) -> int:

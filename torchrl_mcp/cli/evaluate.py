@@ -1,10 +1,9 @@
-"""``torchrl-mcp-evaluate``: how good is a trained policy?
+"""``torchrl-mcp-evaluate``: returns and diagnostics of a trained policy.
 
 With ``--output RUN/evaluation.json`` it leaves in a run folder what training ends with.
 """
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import asdict
@@ -13,10 +12,12 @@ from pathlib import Path
 from torchrl_mcp.evaluation.diagnostics import COLLAPSED
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.training.run_folder import write_json
 
 
 def main() -> None:
-    """Play one episode in each of many environments and print what came of it."""
+    """Play one episode in each of many environments and print the statistics."""
     parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__.partition("\n")[0])
     parser.add_argument(
         "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
@@ -39,25 +40,20 @@ def main() -> None:
         numbers = results[mode]
         low, high = numbers["interval"]
         print(
-            f"  {mode:13} normalised return {numbers['normalised_return']:.3f} "
+            f"{mode}: normalised return {numbers['normalised_return']:.3f} "
             f"(95 % interval of the mean {low:.3f} to {high:.3f}, std {numbers['normalised_return_std']:.3f}), "
             f"return {numbers['return']:.1f}, length {numbers['length']:.0f}, terminated {numbers['terminated']:.0%}"
-            + "".join(f", {name} {value:.3f}" for name, value in numbers["measures"].items())
+            + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
-        for name, value in numbers["diagnostics"].items():
-            print(f"    {name:26} {value:.3f}")
+        if found := numbers["diagnostics"]:
+            print(text_table([{"diagnostic": name, "value": value} for name, value in found.items()]))
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
-            print("    the options have collapsed: one of them acts almost always")
+            print("the options have collapsed: one of them acts almost always")
     if clips:
-        print(f"  {'clip':28} seconds  completed  tracking error  length")
-    for clip in clips:
-        print(
-            f"  {clip.clip:28} {clip.seconds:7.1f}  {clip.completed:9.0%}  {clip.tracking_error:12.3f} m  "
-            f"{clip.length:6.0f}"
-        )
+        print(text_table([asdict(clip) for clip in clips]))
     if arguments.output:
         numbers = results | ({"clips": [asdict(clip) for clip in clips]} if clips else {})
-        arguments.output.write_text(json.dumps(numbers, indent=2) + "\n")
+        write_json(numbers, arguments.output)
 
 
 if __name__ == "__main__":

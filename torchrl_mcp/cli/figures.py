@@ -19,9 +19,10 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories
 from torchrl_mcp.analysis.walk_cycle import draw_walk_cycle
 from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, specialisation
-from torchrl_mcp.report.paper import CHARACTERS, METHODS
+from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import PREFIX, locate
+from torchrl_mcp.runs.tables import text_table
 
 PROGRAM = "torchrl-mcp-figures"
 
@@ -34,8 +35,6 @@ examples:
   {PROGRAM} exploration {PREFIX}humanoid runs/latent-humanoid   # Figure 6
   {PROGRAM} primitives {PREFIX}biped {PREFIX}humanoid          # Figure 7
 """
-
-USUAL_MIXERS = {"mcp": "multiplicative", "moe": "additive"}
 
 PAPER = """\
 The paper (section 5.4) gives no numbers. It reports that weights "show a strong correlation to the phase of a walk
@@ -57,7 +56,7 @@ def holdout(arguments: argparse.Namespace) -> None:
     """Draw Figure 5: learning curves on the held-out directions, and trajectories by target direction."""
     runs: dict[str, dict[str, list[Path]]] = {}
     for path in arguments.checkpoints:
-        cfg = checkpoints.configuration(path)
+        cfg = experiment.policy_config(path)
         if cfg.task.name != "holdout":
             raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that")
         runs.setdefault(_label(cfg), {}).setdefault(cfg.stage.name, []).append(path)
@@ -81,9 +80,9 @@ def explore(arguments: argparse.Namespace) -> None:
     title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
     _save(exploration.draw_exploration(panels, title=title), stem)
     _write([{"panel": name, **row} for name, panel in panels.items() for row in exploration.path_rows(panel)], stem)
-    numbers = [{"panel": name, **exploration.summary(panel)} for name, panel in panels.items()]
+    numbers = [{"panel": name, **exploration.path_statistics(panel)} for name, panel in panels.items()]
     _write(numbers, stem, "summary")
-    print(_table(numbers))
+    print(text_table(numbers))
 
 
 def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], str]:
@@ -98,7 +97,7 @@ def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], st
     panels: dict[str, Exploration] = {}
     for name, cfg, agent in runs:
         explorer = checkpoints.explorer(cfg, agent, num, torch.Generator().manual_seed(seed))
-        label = checkpoints.EXPLORING[cfg.method.name]
+        label = checkpoints.explorer_title(cfg)
         label = f"{label} ({name})" if label in panels else label
         panels[label] = exploration.explore(explorer, agent.parts["observation_normaliser"], env, start)
     generator = torch.Generator().manual_seed(seed)
@@ -111,12 +110,12 @@ def analyse(arguments: argparse.Namespace) -> None:
     """Draw Figure 7: weights over the walk cycle and mean actions of primitives, and say how far they specialise."""
     rows = []
     for name, path in _named(arguments.checkpoints):
-        cfg = checkpoints.configuration(path)
+        cfg = experiment.policy_config(path)
         walk, untrained = checkpoints.walk_of(
             path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
         )
         stem = arguments.output / f"primitives_{name}"
-        title = f"{METHODS[cfg.method.name]}, {CHARACTERS[cfg.character.name]}"
+        title = f"{cfg.method.title}, {CHARACTERS[cfg.character.name]}"
         title += f", walking {arguments.clip or 'straight ahead'}"
         _save(draw_walk_cycle(walk, untrained, title=title), stem)
         _write(cycle_rows(walk), stem, "weights")
@@ -128,7 +127,7 @@ def analyse(arguments: argparse.Namespace) -> None:
             for networks, numbers in (("trained", specialisation(walk)), ("untrained", untrained))
         ]
     _write(rows, arguments.output / "primitives")
-    print(f"{_table(rows)}\n{PAPER}")
+    print(f"{text_table(rows)}\n{PAPER}")
 
 
 def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
@@ -147,13 +146,13 @@ def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
 
 
 def _label(cfg: DictConfig) -> str:
-    """Name of a method, with what of it is unusual."""
+    """Title of a method, with its mixer and exploration if they are not its standard."""
     details = []
-    if cfg.method.name in USUAL_MIXERS and cfg.mixer.name != USUAL_MIXERS[cfg.method.name]:
+    if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
         details.append(cfg.mixer.name)
     if cfg.stage.name == "transfer" and cfg.get("exploration", {}).get("name") == "weights":
         details.append("over weights")
-    return " ".join([METHODS[cfg.method.name], *details])
+    return " ".join([cfg.method.title, *details])
 
 
 def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -179,16 +178,6 @@ def _write(rows: Sequence[Mapping[str, object]], stem: Path, part: str = "") -> 
         for row in rows:
             writer.writerow({key: f"{x:.5g}" if isinstance(x, float) else x for key, x in row.items()})
     print(path)
-
-
-def _table(rows: Sequence[Mapping[str, object]]) -> str:
-    lines = [list(rows[0]), *([_cell(value) for value in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
-
-
-def _cell(value: object) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
 def _parser() -> argparse.ArgumentParser:

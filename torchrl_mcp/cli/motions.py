@@ -3,16 +3,20 @@
 import argparse
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
+from torch import Tensor
+
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.capture.build import HUMANS
-from torchrl_mcp.envs.motions.capture.importer import import_motion
+from torchrl_mcp.envs.motions.capture.importer import Import, imported
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
-from torchrl_mcp.envs.motions.inspection.summary import Summary, summary
+from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
+from torchrl_mcp.envs.motions.inspection.summary import Summary, summarised
+from torchrl_mcp.runs.tables import text_table
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -22,7 +26,7 @@ Files are BVH (.bvh), Acclaim (.amc, beside its .asf), DeepMimic (.json, .txt), 
 examples:
   {PROGRAM} import walk.bvh 02_01.amc --character humanoid --output clips
   {PROGRAM} import walk.bvh --scale 0.3048 --map left_knee=LKnee --map right_knee=RKnee
-  {PROGRAM} inspect clips/*.npz
+  {PROGRAM} inspect clips/*.npz --strides
   {PROGRAM} render clips/walk.npz --output pictures
   {PROGRAM} build-paper-corpus downloads --output corpus
 """
@@ -51,9 +55,25 @@ COLUMNS = (
     "slide m/s",
     "beyond limits",
     "below ground",
+    "legs in legs",
     "torque/limit",
+    "rest pose leans",
 )
 """Of the table, from the modules ``summary`` and ``feasibility`` of :mod:`torchrl_mcp.envs.motions.inspection`."""
+
+STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
+    "length m": lambda strides: strides.stride_length,
+    "steps/min": lambda strides: strides.cadence,
+    "width m": lambda strides: strides.step_width,
+    "stance": lambda strides: strides.stance,
+    "double support": lambda strides: strides.double_support,
+    "bob m": lambda strides: strides.bob,
+    "sway m": lambda strides: strides.sway,
+    "knee swing deg": lambda strides: strides.knee_swing,
+    "foot strikes deg": lambda strides: strides.pitch_strike,
+    "arm swing deg": lambda strides: strides.arm_swing,
+}
+"""Columns of the table of strides, whose medians it shows."""
 
 SLIDING = 0.2
 """m/s. The feet of a motion that is read correctly slide less, those of one that is not more."""
@@ -71,21 +91,26 @@ def main() -> None:
 
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file, and one of its mirror image if wanted."""
-    clips = _load(arguments)
+    motions = _load(arguments)
     if arguments.mirror:
-        clips |= {f"{name}_mirrored": clip.mirrored() for name, clip in clips.items()}
-    _save(clips, arguments.output)
+        motions |= {
+            f"{name}_mirrored": motion._replace(clip=motion.clip.mirrored()) for name, motion in motions.items()
+        }
+    _save(motions, arguments.output)
 
 
 def inspect_files(arguments: argparse.Namespace) -> None:
     """Say what motions are like."""
-    print(_table(_load(arguments)))
+    motions = _load(arguments)
+    print(_table(motions))
+    if arguments.strides:
+        print(f"\n{_strides(motions)}")
 
 
 def render_files(arguments: argparse.Namespace) -> None:
     """Draw a contact sheet and a film of each motion."""
     arguments.output.mkdir(parents=True, exist_ok=True)
-    for name, clip in _load(arguments).items():
+    for name, (clip, _) in _load(arguments).items():
         sheet, film = arguments.output / f"{name}.png", arguments.output / f"{name}.gif"
         save_picture(contact_sheet(clip), sheet)
         save_film(clip, film, seconds=arguments.seconds)
@@ -98,28 +123,29 @@ def build_paper_corpus(arguments: argparse.Namespace) -> None:
     if missing := [name for name, found in paths.items() if not found]:
         lines = "".join(f"\n  {name} (from {SOURCES[Path(name).suffix]})" for name in missing)
         raise ValueError(f"{arguments.folder} lacks{lines}\nDownload them into it, and mind their terms of use.")
-    clips = {}
+    motions = {}
     for name, [path] in paths.items():
-        clip = import_motion(path, arguments.character, rate=arguments.rate)
+        motion = imported(path, arguments.character, rate=arguments.rate)
+        clip = motion.clip
         if abs(clip.duration - PAPER_CORPUS[name]) > 0.1:
             expected = f"{path} lasts {clip.duration:.2f} s, and the paper's corpus needs {PAPER_CORPUS[name]:.2f} s"
             raise ValueError(f"{expected}: it is another file, or was changed; download it again")
-        clips[path.stem] = clip
+        motions[path.stem] = motion
         if not clip.loop:
-            clips[f"{path.stem}_mirrored"] = clip.mirrored()
-    _save(clips, arguments.output)
+            motions[f"{path.stem}_mirrored"] = motion._replace(clip=clip.mirrored())
+    _save(motions, arguments.output)
 
 
-def _load(arguments: argparse.Namespace) -> dict[str, MotionClip]:
+def _load(arguments: argparse.Namespace) -> dict[str, Import]:
     """Read the files, by their names without suffix."""
-    clips: dict[str, MotionClip] = {}
+    motions: dict[str, Import] = {}
     for path in arguments.files:
-        if path.stem in clips:
+        if path.stem in motions:
             raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
         if path.suffix == ".npz":
-            clips[path.stem] = MotionClip.load(path)
+            motions[path.stem] = Import(MotionClip.load(path), math.nan)
             continue
-        clips[path.stem] = import_motion(
+        motions[path.stem] = imported(
             path,
             arguments.character,
             rate=arguments.rate,
@@ -130,32 +156,30 @@ def _load(arguments: argparse.Namespace) -> dict[str, MotionClip]:
             rest_frame=arguments.rest_frame,
             asf=arguments.asf,
         )
-    return clips
+    return motions
 
 
-def _save(clips: Mapping[str, MotionClip], folder: Path) -> None:
+def _save(motions: Mapping[str, Import], folder: Path) -> None:
     """Write clips into a folder, and say what they are like."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, clip in clips.items():
+    for name, (clip, _) in motions.items():
         clip.save(folder / f"{name}.npz")
-    print(f"{_table(clips)}\nwritten to {folder}")
+    print(f"{_table(motions)}\nwritten to {folder}")
 
 
-def _table(clips: Mapping[str, MotionClip]) -> str:
+def _table(motions: Mapping[str, Import]) -> str:
     """Return a line for each clip, and warn of those whose feet slide."""
-    summaries = {name: summary(clip) for name, clip in clips.items()}
-    rows = [COLUMNS, *(_row(name, clip, summaries[name]) for name, clip in clips.items())]
-    rows.append(("total", "", f"{sum(numbers.duration for numbers in summaries.values()):.1f}", *[""] * 7))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    summaries = {name: summarised(motion.clip) for name, motion in motions.items()}
+    rows = [_row(name, *motion, summaries[name]) for name, motion in motions.items()]
+    total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
+    rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
+    lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
     if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
-        lines.append(
-            f"The feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
-        )
-    return "\n".join(lines)
+        lines += f"\nThe feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
+    return lines
 
 
-def _row(name: str, clip: MotionClip, numbers: Summary) -> tuple[str, ...]:
+def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tuple[str, ...]:
     demand = feasibility(clip)
     return (
         name,
@@ -167,8 +191,25 @@ def _row(name: str, clip: MotionClip, numbers: Summary) -> tuple[str, ...]:
         "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
         f"{math.degrees(demand.limit):.1f} deg",
         f"{100 * demand.penetration:.1f} cm",
+        f"{100 * demand.crossing:.1f} cm",
         f"{demand.torque:.2f}",
+        "-" if math.isnan(rest_lean) else f"{rest_lean:.1f} deg",
     )
+
+
+def _strides(motions: Mapping[str, Import]) -> str:
+    """Return a line of medians over the whole strides of each clip of a human body."""
+    rows = []
+    for name, (clip, _) in motions.items():
+        if clip.character in HUMANS:
+            strides = gait_statistics(clip)
+            medians = [
+                float(measure(strides).quantile(0.5)) if len(strides.speed) else math.nan
+                for measure in STRIDES.values()
+            ]
+            cells = ("-" if math.isnan(median) else f"{median:.3g}" for median in medians)
+            rows.append({"clip": name, "strides": str(len(strides.speed)), **dict(zip(STRIDES, cells, strict=True))})
+    return text_table(rows)
 
 
 def _joint_map(pairs: list[str]) -> dict[str, str] | None:
@@ -187,10 +228,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
-    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who shall move (default humanoid)")
+    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who moves (default humanoid)")
     target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
-    source.add_argument("--fps", type=float, help="frames per second of the files, if not as they say (.amc: 120)")
+    source.add_argument("--fps", type=float, help="frames per second of the files, if not what they state (.amc: 120)")
     source.add_argument("--scale", type=float, help="metres per unit of length; found by the length of the legs")
     source.add_argument(
         "--map", action="append", default=[], metavar="PART=JOINT", help="which joint is a part of the body; repeatable"
@@ -208,6 +249,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run=import_files)
     command = commands.add_parser("inspect", parents=[source, target], help="duration, speed, turn rate, slide, limits")
+    command.add_argument("--strides", action="store_true", help="length, cadence, width and more of human strides, too")
     command.set_defaults(run=inspect_files)
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
     command.add_argument("--seconds", type=float, default=10.0, help="length of the film at most (default 10)")

@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         default=1.0,
         metavar="D",
-        help="how far beside the character its reference is drawn, in its own reaches; 0: where it is (default 1)",
+        help="distance of the ghost from the character, in extents of the character; 0 is where it is (default 1)",
     )
     film = parser.add_argument_group("film")
     film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default film.gif)")
@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     viewer.add_argument(
         "--viewer",
         choices=["web", "window"],
-        help="instead of a film: a browser, with MuJoCo Studio, which anyone who reaches the port can see, or a window",
+        help="show it live instead: in a browser (anyone who can reach the port can watch), or in a window",
     )
     viewer.add_argument("--port", type=int, default=0, help="of the page (default: the first free one from 8080)")
     return parser

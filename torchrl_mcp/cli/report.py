@@ -1,4 +1,4 @@
-"""``torchrl-mcp-report``: what came of many runs, beside the paper's figures, as a web page and as Markdown."""
+"""``torchrl-mcp-report``: the results of many runs beside the paper's, as a web page and as Markdown."""
 
 import argparse
 import math
@@ -12,20 +12,21 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_mcp import __version__
-from torchrl_mcp.report.comparison import cells, over_tasks
-from torchrl_mcp.report.paper import METHODS, TABLE_2
+from torchrl_mcp.report.comparison import cells, methods, over_tasks
+from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.report.results import MODES, STATES, Damaged, Run, find_runs
 from torchrl_mcp.report.sections import (
     Row,
     Section,
     ablation_chapters,
     diagnostic_tables,
-    method_title,
+    method_colours,
     place_title,
     row,
     task_sections,
 )
 from torchrl_mcp.training import precision
+from torchrl_mcp.training.run_folder import replacing
 
 PAGES = ("report.html", "report.md")
 
@@ -43,9 +44,9 @@ def main() -> None:
         runs, damaged = find_runs(arguments.runs)
     except ValueError as error:
         sys.exit(f"torchrl-mcp-report: {error}")
-    arguments.output.mkdir(parents=True, exist_ok=True)
     for name, text in report(runs, damaged, moment=datetime.now(UTC)).items():
-        (arguments.output / name).write_text(text, encoding="utf-8")
+        with replacing(arguments.output / name) as partial:
+            partial.write_text(text, encoding="utf-8")
     counts = ", ".join(f"{number} {state}" for state, number in _states(runs, damaged).items() if number)
     print(f"{len(runs) + len(damaged)} runs, {counts}: {' '.join(str(arguments.output / name) for name in PAGES)}")
 
@@ -77,17 +78,19 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
     names = (f"plot-{number}" for number in count(1))
     machines = list(dict.fromkeys(map(_machine, runs)))
     shared, aggregate = over_tasks(found)
+    palette = method_colours(found)
     context = {
         "runs": [run for cell in found for run in cell.runs],
         "states": _states(runs, damaged),
         "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
-        "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_papers]),
+        "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_standard]),
+        "titles": methods(found),
         "shared": shared,
         "aggregate": aggregate,
-        "transfer": task_sections(stages["transfer"], names),
+        "transfer": task_sections(stages["transfer"], names, palette),
         "ablations": ablation_chapters(found, names),
         "diagnostics": diagnostic_tables(found),
-        "pretraining": task_sections(stages["pretrain"], names),
+        "pretraining": task_sections(stages["pretrain"], names, palette),
         "machines": machines,
     }
     return context | {
@@ -106,16 +109,14 @@ def _states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
 
 def _overview(rows: Sequence[Row]) -> dict[str, Any]:
     """Columns and rows of Table 2: the methods, and a section per task and character."""
-    present = dict.fromkeys(r.cell.method for r in rows)
-    methods = [*(method for method in METHODS if method in present), *(m for m in present if m not in METHODS)]
     places = dict.fromkeys(r.cell.place for r in rows)
     sections = {place: Section(place_title(place), [r for r in rows if r.cell.place == place]) for place in places}
-    return {"methods": methods, "sections": sections}
+    return {"methods": methods(r.cell for r in rows), "sections": sections}
 
 
 def _machine(run: Run) -> str:
     """The machine, the precision of the networks and the libraries of a run in one line."""
-    machine = run.origin.get("machine") or {}
+    machine = run.provenance.get("machine") or {}
     parts = (
         f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
     )
@@ -138,7 +139,6 @@ FILTERS = {
     "capital": lambda text: text[:1].upper() + text[1:],
     "words": lambda name: name.replace("_", " ").capitalize(),
     "place": place_title,
-    "method": method_title,
     "cell": lambda text: str(text).replace("|", r"\|").replace("\n", " "),
 }
 """Of the templates. ``cell`` is for Markdown's tables."""

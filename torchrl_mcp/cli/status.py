@@ -1,4 +1,4 @@
-"""``torchrl-mcp-status``: how far are the runs of a folder?"""
+"""``torchrl-mcp-status``: the progress of all runs of a folder."""
 
 import argparse
 import sys

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.runs import benchmark, experiment
+from torchrl_mcp.runs import benchmark, build, experiment
 
 
 @hydra.main(version_base="1.3", config_path="pkg://torchrl_mcp.conf", config_name="train")
@@ -31,7 +31,7 @@ def run_benchmark(arguments: list[str]) -> None:
     parser.add_argument("--config-dir", "-cd", type=Path)
     options, settings = parser.parse_known_args(arguments)
     if unknown := [setting for setting in settings if setting.startswith("-")]:
-        sys.exit(f"torchrl-mcp-train: a benchmark knows settings and --config-dir, not {' '.join(unknown)}")
+        sys.exit(f"torchrl-mcp-train: a benchmark takes settings and --config-dir, but not {' '.join(unknown)}")
     if options.config_dir:
         settings.append(f"hydra.searchpath=[file://{options.config_dir.resolve()}]")
     try:
@@ -71,7 +71,9 @@ def suggestions(arguments: list[str]) -> list[str]:
     settings = _keys(OmegaConf.to_container(cfg))
     unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *settings} and not o.is_add()]
     return [
-        f"{key!r} is no setting of this method; the nearest are: "
+        f"{key!r} stands in no file, but it is an argument: write it with a plus, +{key}=..."
+        if _is_argument(key, cfg)
+        else f"{key!r} is no setting of this method; the nearest are: "
         + ", ".join(difflib.get_close_matches(key, {*groups, *settings}, n=3, cutoff=0.5) or sorted(groups))
         for key in unknown
     ]
@@ -84,6 +86,13 @@ def _resume(folder: Path) -> Path:
     if experiment.is_complete(folder):
         print(f"{folder} is complete: nothing is left to do")
     return experiment.resume(folder)
+
+
+def _is_argument(key: str, cfg: DictConfig) -> bool:
+    """Tell whether a setting is an argument of what its group makes."""
+    group, _, name = key.rpartition(".")
+    made = group and OmegaConf.select(cfg, f"{group}._target_")
+    return bool(made) and name in build.arguments(made)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

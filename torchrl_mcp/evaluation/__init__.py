@@ -1,1 +1,1 @@
-"""Episodes played for their returns, for each reference motion, and for what gates and options do in them."""
+"""Evaluation: returns of episodes, tracking of each reference motion, and diagnostics of gates and options."""

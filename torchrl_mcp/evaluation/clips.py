@@ -1,4 +1,4 @@
-"""How well a policy follows each of its reference motions."""
+"""Evaluation of a policy on each of its reference motions."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from torchrl_mcp.evaluation.rollout import evaluate
 
 @dataclass(frozen=True)
 class ClipResult:
-    """Episodes that follow one clip.
+    """Statistics of the episodes that follow one clip.
 
     Attributes:
         clip: Its name.
@@ -60,7 +60,7 @@ def follow_each(
     env.reset()
     start = env.get_state().update(TensorDict(env.beginning(clips, times), env.batch_size))
     outcome = evaluate(policy, env, start=start, deterministic=deterministic, device=device)
-    columns = (~outcome.terminated, outcome.measures["tracking_error"], outcome.lengths)
+    columns = (~outcome.terminated, outcome.metrics["tracking_error"], outcome.lengths)
     means = torch.stack([column.double().view(count, episodes).mean(1) for column in columns], 1).tolist()
     rows = zip(library.names, library.durations.tolist(), means, strict=True)
     return [ClipResult(name, seconds, episodes, *numbers) for name, seconds, numbers in rows]

@@ -1,4 +1,4 @@
-"""What is said of a method's inner choices, in training and evaluation alike."""
+"""Gate and option diagnostics, for training and evaluation."""
 
 import torch
 from tensordict import TensorDictBase

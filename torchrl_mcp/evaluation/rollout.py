@@ -1,7 +1,8 @@
-"""How good is a policy? One episode in each of many environments."""
+"""Evaluation of a policy by one episode in each of many environments."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -9,17 +10,19 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_mcp.evaluation.statistics import mean
+
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes, one per environment.
+    """The outcome of one episode per environment.
 
     Attributes:
         returns: Undiscounted sum of rewards of each episode, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
-        measures: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
+        metrics: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
             as ``success``; of a number, its mean over the steps, as ``tracking_error``.
         decisions: What was recorded of the policy, of all steps of all episodes, batch size ``(M,)``.
     """
@@ -28,7 +31,7 @@ class Evaluation:
     lengths: Tensor
     terminated: Tensor
     positions: Tensor
-    measures: dict[str, Tensor] = field(default_factory=dict)
+    metrics: dict[str, Tensor] = field(default_factory=dict)
     decisions: TensorDictBase = field(default_factory=TensorDict)
 
 
@@ -84,38 +87,36 @@ def evaluate(
             running &= ~outcome["done"].squeeze(-1)
             positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
     means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
-    measures = {
+    metrics = {
         name: value
         for key, values in (flags | means).items()
         for name, value in zip(names[key], values.unbind(-1), strict=True)
     }
-    return Evaluation(returns, lengths, terminated, torch.stack(positions), measures, torch.cat(decisions))
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), metrics, torch.cat(decisions))
 
 
-def summary(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor], *, resamples: int = 2000) -> dict:
-    """Condense episodes into numbers.
+def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Return means over episodes, and how sure they are.
 
     Args:
         outcome: The episodes.
         normalised_return: The task's normalisation of returns.
-        resamples: Bootstrap resamples of the episodes behind ``interval``.
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``measures``), the standard deviation over episodes (0 of a single one), and a 95 % percentile
-        bootstrap interval of the mean.
+        fraction, ``metrics``), the standard deviation over episodes (0 of a single one), and a 95 % percentile
+        bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
     """
     normalised = normalised_return(outcome.returns)
-    generator = torch.Generator().manual_seed(0)
-    index = torch.randint(len(normalised), (resamples, len(normalised)), generator=generator)
-    low, high = normalised[index].mean(1).quantile(torch.tensor([0.025, 0.975])).tolist()
+    estimate = mean(normalised.tolist())
+    single = len(normalised) == 1
     return {
         "normalised_return": normalised.mean().item(),
-        "normalised_return_std": normalised.std(correction=min(1, len(normalised) - 1)).item(),
-        "interval": [low, high],
+        "normalised_return_std": 0.0 if single else normalised.std().item(),
+        "interval": [estimate.value] * 2 if single else [estimate.low, estimate.high],
         "return": outcome.returns.mean().item(),
         "length": outcome.lengths.float().mean().item(),
         "terminated": outcome.terminated.float().mean().item(),
         "episodes": len(normalised),
-        "measures": {key: value.float().mean().item() for key, value in outcome.measures.items()},
+        "metrics": {key: value.float().mean().item() for key, value in outcome.metrics.items()},
     }

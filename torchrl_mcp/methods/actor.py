@@ -1,4 +1,4 @@
-"""What methods share: networks become TensorDictModules.
+"""The actor that all methods build: networks as TensorDictModules.
 
 A method first makes named *parts*, plain modules that transfer keeps, freezes or starts anew by their names, and then
 an :class:`Actor` over them: the ``policy`` that acts, and what the loss differentiates, ``trained``. Both are one and
@@ -35,6 +35,12 @@ GOAL = ("normalised", "goal")
 PRIMITIVES = (("primitives", "loc"), ("primitives", "scale"))
 
 Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
+
+Explorer = Callable[[Tensor], Tensor]
+"""From normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal: random exploration of Section 5.3.
+
+A method names as ``method.explorer`` what makes one from its parts, the number N and a generator.
+"""
 
 
 @dataclass(frozen=True)

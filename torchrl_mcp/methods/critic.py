@@ -24,6 +24,10 @@ def value_critic(
         Peng et al., *MCP*, NeurIPS 2019, Section E.1. https://arxiv.org/abs/1905.09808
     """
     parts["critic"] = MLP(
-        in_features=observation_dim + goal_dim, out_features=1, num_cells=list(num_cells), activation_class=nn.ReLU
+        in_features=observation_dim + goal_dim,
+        out_features=1,
+        num_cells=list(num_cells),
+        activation_class=nn.ReLU,
+        activation_kwargs={"inplace": True},  # the same numbers without a second copy of every hidden layer
     )
     return TensorDictSequential(normalise_inputs(parts), ValueOperator(parts["critic"], in_keys=[STATE, GOAL]))

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Collection
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.methods.options import OptionActor, WhereBeginning, keep_option
+from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import OptionActor, RandomSequence, WhereBeginning, keep_option
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 
@@ -28,7 +29,7 @@ def primitive_parts(
         goal_dim: Size of the goal, ``G``, which only the critic sees.
         action_dim: Size of the action, ``A``.
         primitives: Makes the primitives from ``(S, A, K)``.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         normaliser: Makes an input normaliser from a size.
     """
     return nn.ModuleDict(
@@ -57,7 +58,7 @@ def gated_parts(
         action_dim: Size of the action, ``A``.
         gating: Makes the network for the logits of the choice from ``(S, G, K)``.
         primitives: Makes the primitives from ``(S, A, K)``.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         normaliser: Makes an input normaliser from a size.
     """
     parts = primitive_parts(
@@ -72,7 +73,7 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
 
     Args:
         parts: Made by :func:`primitive_parts`.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         frozen: Names of the parts that do not change in training.
     """
     policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), *_acting(parts))
@@ -86,7 +87,7 @@ def gated_actor(
 
     Args:
         parts: Made by :func:`gated_parts`.
-        num_options: Number of primitives, ``K``.
+        num_options: Number of options, ``K``, each of which is a primitive.
         steps_per_choice: Control steps for which a primitive acts.
         frozen: Names of the parts that do not change in training.
 
@@ -115,8 +116,23 @@ def gated_actor(
     return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
 
 
+def random_sequence(
+    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
+) -> Explorer:
+    """Return an explorer that lets one primitive act after another in random order.
+
+    Args:
+        parts: Made by :func:`primitive_parts`.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_options: Number of primitives, ``K``.
+        steps: Control steps for which each acts.
+    """
+    return RandomSequence(parts["primitives"], num, generator, num_options=num_options, steps=steps)
+
+
 class Clock(nn.Module):
-    """Tells when it is time for another choice."""
+    """The clock that says when the gate chooses again."""
 
     def __init__(self, steps_per_choice: int) -> None:
         """Take the number of steps from one choice to the next."""

@@ -25,7 +25,7 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 NOISE = ("latent", "noise")
@@ -93,3 +93,16 @@ def latent_noise(loc: Tensor) -> Tensor:
     """Return standard normal noise in the shape of ``loc``, or zeros where TorchRL's exploration is off."""
     random = interaction_type() in (InteractionType.RANDOM, None)
     return torch.randn_like(loc) if random else torch.zeros_like(loc)
+
+
+def random_latents(parts: nn.ModuleDict, num: int, generator: torch.Generator, *, latent_dim: int) -> Explorer:
+    """Return an explorer that decodes a random latent variable, one for each simulation, and plays the mean action.
+
+    Args:
+        parts: Made by :func:`latent_parts`.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        latent_dim: Size of the latent variable, ``L``.
+    """
+    latent = torch.randn(num, latent_dim, generator=generator)
+    return lambda state: parts["decoder"](state, latent)[0]

@@ -16,6 +16,7 @@ from torchrl_mcp.methods.actor import (
     STATE,
     Actor,
     Composition,
+    Explorer,
     input_normalisers,
     normalise_inputs,
     sampler,
@@ -144,8 +145,40 @@ def weights_actor(
     return Actor(policy, trained, stored=("gates", "gate_logits"), sampled="gate_logits")
 
 
+def random_weights(
+    parts: nn.ModuleDict,
+    num: int,
+    generator: torch.Generator,
+    *,
+    num_primitives: int,
+    gate_activation: Callable[[Tensor], Tensor],
+    distribution_class: Composition,
+) -> Explorer:
+    """Return an explorer that composes the primitives with random weights, one set for each simulation.
+
+    It plays the composite's deterministic action.
+
+    Args:
+        parts: Made by :func:`composite_parts`.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_primitives: Number of primitives, ``K``.
+        gate_activation: From logits to weights.
+        distribution_class: The mixer, of ``(loc, scale, gates)``.
+    """
+    # Paper: Gaussian weights. Here the logits are, as with exploration=weights: weights stay between 0 and 1.
+    gates = gate_activation(torch.randn(num, num_primitives, generator=generator))
+    composite = DeterministicAction(distribution_class)
+
+    def explore(state: Tensor) -> Tensor:
+        loc, scale = parts["primitives"](state)
+        return composite(loc, scale, gates)
+
+    return explore
+
+
 class ConstantScale(nn.Module):
-    """A standard deviation that depends on nothing."""
+    """A standard deviation that does not depend on the input."""
 
     def __init__(self, std: float) -> None:
         """Take the standard deviation, positive."""

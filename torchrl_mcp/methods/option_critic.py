@@ -1,4 +1,4 @@
-r"""The option-critic baseline: options that end when they see fit, and values that choose among them (Section E.5).
+r"""The option-critic baseline: options with learned terminations, and values that choose among them (Section E.5).
 
 .. math::
     U(\omega, s') = (1 - \beta_\omega(s')) Q_\Omega(s', \omega) + \beta_\omega(s') V_\Omega(s')
@@ -27,8 +27,15 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, PRIMITIVES, STATE, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.methods.options import EpsilonGreedy, OptionActor, WhereBeginning, keep_option, of_option
+from torchrl_mcp.methods.actor import GOAL, PRIMITIVES, STATE, Explorer, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import (
+    EpsilonGreedy,
+    OptionActor,
+    RandomSequence,
+    WhereBeginning,
+    keep_option,
+    of_option,
+)
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 ARRIVAL = ("next", "observation")
@@ -67,6 +74,7 @@ def option_critic_parts(
                 out_features=num_options,
                 num_cells=list(values_cells),
                 activation_class=nn.ReLU,
+                activation_kwargs={"inplace": True},
             ),
         }
     )
@@ -122,6 +130,26 @@ def option_values(parts: nn.ModuleDict, observation_dim: int, goal_dim: int) -> 
         TensorDictModule(parts["critic"], in_keys=[STATE, GOAL], out_keys=["option_values"]),
         TensorDictModule(parts["terminations"], in_keys=[STATE], out_keys=["terminations"]),
     )
+
+
+def random_sequence(
+    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
+) -> Explorer:
+    """Return an explorer that lets one option act after another in random order.
+
+    Args:
+        parts: Made by :func:`option_critic_parts`.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_options: Number of options, ``K``.
+        steps: Control steps for which each acts.
+    """
+
+    def options(state: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
+        loc, scale = parts["options"](state)
+        return acting_option(loc, scale, option)
+
+    return RandomSequence(options, num, generator, num_options=num_options, steps=steps)
 
 
 def begins(terminations: Tensor, held_option: Tensor, held_steps: Tensor) -> Tensor:

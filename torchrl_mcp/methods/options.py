@@ -68,7 +68,7 @@ class Terminations(nn.Module):
         super().__init__()
         _require_options(num_options)
         if not 0 < initial < 1:
-            raise ValueError(f"initial={initial} is no probability of termination: pass a number between 0 and 1")
+            raise ValueError(f"initial={initial} is not a probability: pass a number between 0 and 1")
         self.body = relu_mlp(observation_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
         nn.init.constant_(self.output.bias, math.log(initial / (1 - initial)))
@@ -79,7 +79,7 @@ class Terminations(nn.Module):
 
 
 class WhereBeginning(nn.Module):
-    """Evaluates scores only where an option begins: elsewhere nobody asks, and they are zero.
+    """Scores that are evaluated only where an option begins, and are zero elsewhere.
 
     Args:
         scores: From state ``(n, S)`` and goal ``(n, G)`` to ``(n, K)``.
@@ -95,6 +95,38 @@ class WhereBeginning(nn.Module):
         scores = torch.zeros(*begins.shape, self.num_options, device=begins.device)
         scores[begins] = self.scores(observation[begins], goal[begins]).float()
         return scores
+
+
+class RandomSequence:
+    """An explorer that lets one option act after another in random order, and plays mean actions.
+
+    Args:
+        options: From states and the options that act, ``(N,)``, to means and standard deviations, each ``(N, A)``.
+        num: Number of simulations, ``N``.
+        generator: Source of randomness.
+        num_options: Number of options, ``K``.
+        steps: Control steps for which each acts.
+    """
+
+    def __init__(
+        self,
+        options: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        num: int,
+        generator: torch.Generator,
+        *,
+        num_options: int,
+        steps: int,
+    ) -> None:
+        self._options, self._num, self._generator = options, num, generator
+        self._num_options, self._steps = num_options, steps
+        self._elapsed, self._option = 0, torch.zeros(num, dtype=torch.int64)
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Return the actions of the next step, ``(N, A)``, from states ``(N, S)``."""
+        if self._elapsed % self._steps == 0:
+            self._option = torch.randint(self._num_options, (self._num,), generator=self._generator)
+        self._elapsed += 1
+        return self._options(state, self._option)[0]
 
 
 class EpsilonGreedy(Categorical):

@@ -1,6 +1,6 @@
-"""What a policy must remember from one step to the next, as part of what the environment shows.
+"""Environment transforms that carry a policy's state from one step to the next.
 
-TorchRL's collectors know a policy's memory if the environment has a spec for it; the transforms here give it one.
+TorchRL's collectors keep such a state if the environment has a spec for it, which these transforms add.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from torchrl.envs import Transform, TransformedEnv
 
 
 class TransformedCharacterEnv(TransformedEnv):
-    """Environments with transforms, of both of which the state can be set, saved and restored.
+    """Environments with transforms; the state of both can be set, saved and restored.
 
     TorchRL's own class saves the transforms alone, and loses a state to reset to before it reaches the environments.
     """
@@ -35,7 +35,7 @@ class TransformedCharacterEnv(TransformedEnv):
 
 
 class OptionMemory(Transform):
-    """Shows a policy the option of the step before, ``held_option``, and for how many steps it has acted.
+    """A transform that shows a policy the option of the step before, ``held_option``, and how many steps it has acted.
 
     ``held_steps`` is 0 at the beginning of an episode, where no option is held. The policy writes ``option`` and
     whether it has chosen it in this step, ``begins``, each ``(N,)``; one that writes neither keeps what is held.
@@ -79,7 +79,7 @@ class OptionMemory(Transform):
 
 
 class ClipAsOption(Transform):
-    """Shows which reference motion each environment follows, as ``option``: every option imitates a clip of its own.
+    """A transform that shows the reference motion of each environment as ``option``: every option imitates one clip.
 
     Args:
         num_options: Number of options, and of the reference motions.

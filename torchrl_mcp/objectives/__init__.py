@@ -2,9 +2,10 @@
 
 from torchrl_mcp.objectives.advantages import Advantages
 from torchrl_mcp.objectives.latent import LatentPPOLoss
-from torchrl_mcp.objectives.option_critic import OptionAdvantages, OptionCriticLoss
+from torchrl_mcp.objectives.option_critic import OptionAdvantages, OptionCriticLoss, OptionValueLoss
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 from torchrl_mcp.objectives.semi_markov import SemiMarkovAdvantages
+from torchrl_mcp.objectives.values import ValueLoss
 
 __all__ = [
     "Advantages",
@@ -12,5 +13,7 @@ __all__ = [
     "LatentPPOLoss",
     "OptionAdvantages",
     "OptionCriticLoss",
+    "OptionValueLoss",
     "SemiMarkovAdvantages",
+    "ValueLoss",
 ]

@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Normal, kl_divergence
 
 from torchrl_mcp.methods.latent_space import ENCODING
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
@@ -23,7 +24,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
 
     Args:
         actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
-        critic_network: The value function.
+        critic_network: The value function, or None where it learns by a loss of its own.
         kl_coeff: Weight of the penalty, :math:`\beta`.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
 
@@ -34,7 +35,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
+        critic_network: TensorDictModuleBase | None,
         *,
         kl_coeff: float,
         **kwargs: Any,
@@ -45,7 +46,9 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_latent`` to the terms of the bounded loss, and report the divergence as ``latent_kl`` in nats."""
         out = super().forward(tensordict)
-        kl = standard_normal_kl(*self._encoding).mean()
+        loc, scale = self._encoding
+        prior = Normal(torch.zeros_like(loc), torch.ones_like(scale))
+        kl = kl_divergence(Normal(loc, scale), prior).sum(-1).mean()
         del self._encoding
         return out.set("loss_latent", self.kl_coeff * kl).set("latent_kl", kl.detach())
 
@@ -56,18 +59,3 @@ class LatentPPOLoss(BoundedClipPPOLoss):
         # The networks have just written what they computed.
         self._encoding = [tensordict[key] for key in ENCODING]
         return outcome
-
-
-def standard_normal_kl(loc: Tensor, scale: Tensor) -> Tensor:
-    r"""Return the divergence of diagonal Gaussians from the standard normal distribution.
-
-    .. math:: D_{KL} = \sum_i \frac{\mu_i^2 + \sigma_i^2 - 1}{2} - \log \sigma_i
-
-    Args:
-        loc: Means, shape ``(*B, L)``.
-        scale: Standard deviations, shape ``(*B, L)``.
-
-    Returns:
-        Divergences in nats, shape ``(*B,)``.
-    """
-    return ((loc.square() + scale.square() - 1) / 2 - scale.log()).sum(-1)

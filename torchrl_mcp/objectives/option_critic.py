@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
+from torchrl_mcp.objectives.values import ValueLoss
 
 
 class OptionAdvantages:
@@ -92,6 +93,21 @@ class OptionAdvantages:
         return criticised["option_values"].float(), criticised["terminations"].float()
 
 
+class OptionValueLoss(ValueLoss):
+    r"""Mean squared error of the values of the options that acted, the third term of :class:`OptionCriticLoss`.
+
+    .. math:: L = c \, \mathbb{E} (Q_\Omega(s, \omega) - y)^2
+
+    Args:
+        critic_network: From ``observation`` and ``goal`` to ``option_values``.
+        coeff: Weight of the error, :math:`c`.
+    """
+
+    def _values(self, samples: TensorDictBase) -> Tensor:
+        values = self.critic_network(samples.select(*self.critic_network.in_keys))["option_values"]
+        return of_option(values, samples["option"])
+
+
 class OptionCriticLoss(LossModule):
     r"""The updates of the option-critic, as one loss.
 
@@ -109,7 +125,8 @@ class OptionCriticLoss(LossModule):
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
             :math:`\beta_\omega(s')`.
-        critic_network: From ``observation`` and ``goal`` to ``option_values``.
+        critic_network: From ``observation`` and ``goal`` to ``option_values``; None leaves the third term to
+            :class:`OptionValueLoss`.
         clip_epsilon: :math:`\epsilon`.
         bound_coeff: Weight of the penalty on means out of bounds, :math:`c`; 0 for distributions without a mean.
         bound: Largest absolute mean action, :math:`b`.
@@ -138,7 +155,7 @@ class OptionCriticLoss(LossModule):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
+        critic_network: TensorDictModuleBase | None,
         *,
         clip_epsilon: float,
         bound_coeff: float,
@@ -158,30 +175,33 @@ class OptionCriticLoss(LossModule):
         """Keys of a sample that the loss reads."""
         keys = self.tensor_keys
         estimates = [keys.sample_log_prob, keys.option, keys.advantage, keys.termination_advantage, keys.value_target]
-        networks = [*self.actor_network.in_keys, *self.critic_network.in_keys]
-        return list(dict.fromkeys([keys.action, *networks, *estimates]))
+        critic = [] if self.critic_network is None else self.critic_network.in_keys
+        return list(dict.fromkeys([keys.action, *self.actor_network.in_keys, *critic, *estimates]))
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of what the loss returns."""
+        critic = [] if self.critic_network is None else ["loss_critic"]
         if not self._learns_options():
-            return ["loss_critic"]
-        losses = ["loss_critic", "loss_objective", "loss_termination", "loss_bound"]
+            return critic
+        losses = [*critic, "loss_objective", "loss_termination", "loss_bound"]
         return [*losses, "kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the terms of the loss, and what they say of the update, as scalars."""
-        terms = {"loss_critic": self._critic_loss(tensordict)}
+        terms = self._critic_losses(tensordict)
         if self._learns_options():
             terms |= self._option_losses(tensordict)
         return TensorDict(terms)
 
-    def _critic_loss(self, tensordict: TensorDictBase) -> Tensor:
+    def _critic_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        if self.critic_network is None:
+            return {}
         keys = self.tensor_keys
         values = self.critic_network(tensordict.select(*self.critic_network.in_keys))[keys.option_values]
         error = of_option(values, tensordict[keys.option]) - tensordict[keys.value_target]
-        return error.square().mean() / 2
+        return {"loss_critic": error.square().mean() / 2}
 
     def _option_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         keys = self.tensor_keys

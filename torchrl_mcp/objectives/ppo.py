@@ -18,7 +18,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
 
     Args:
         actor_network: The policy.
-        critic_network: The value function.
+        critic_network: The value function, or None where it learns by a loss of its own.
         bound_coeff: Weight of the penalty, :math:`c`.
         bound: Largest absolute mean action, :math:`b`.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
@@ -31,7 +31,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
+        critic_network: TensorDictModuleBase | None,
         *,
         bound_coeff: float,
         bound: float = 1.0,

@@ -1,1 +1,1 @@
-"""The report: what came of many runs, beside the paper's figures."""
+"""The report: the results of many runs beside the paper's."""

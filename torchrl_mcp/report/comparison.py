@@ -1,4 +1,4 @@
-"""Runs side by side: which may be averaged, what tells the others apart, and what the paper says of them."""
+"""Comparison of runs: cells of seeds that may be averaged, their differences, and the paper's numbers."""
 
 import math
 from collections import defaultdict
@@ -7,19 +7,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
-from torchrl_mcp.report.paper import METHODS, PLACES, SETTINGS, TABLE_2, Reported
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
+from torchrl_mcp.report.paper import METHODS, PLACES, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
-from torchrl_mcp.report.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
+from torchrl_mcp.runs.identity import UNLEARNT, is_among
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
 
-# What changes where, how fast or how visibly a run learns, not what it learns; the stages' environments are in task.*.
-BOOKKEEPING = (
-    *("seed", "device", "autocast", "num_threads", "torch_threads", "collector", "benchmark", "evaluation"),
-    *("pretrained", "resume", "run_root", "run_dir", "checkpoint_interval", "keep_checkpoints"),
-    *("progress_bar", "logger", "motions", "imitation", "task.fast", "task.evaluation"),
-)
+DEFAULT = "default"
+"""Value of an argument that no setting of a run names."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +45,19 @@ class Cell:
         return [run for run in self.runs if run.state == "complete"]
 
     @property
-    def is_papers(self) -> bool:
-        """Whether it is a method of Table 2, not a variant of one."""
-        papers = SETTINGS.get(self.method, {})
-        return all(self.choices.get(name) == value for name, value in papers.items())
+    def title(self) -> str:
+        """Title of the method."""
+        return self.runs[0].title
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether its settings are those by which the method is known: it is no variant."""
+        return all(self.choices[name] == value for name, value in self.runs[0].standard.items())
 
     @property
     def reported(self) -> Reported | None:
         """The paper's figure, if it has one."""
-        comparable = self.stage == "transfer" and self.is_papers
+        comparable = self.stage == "transfer" and self.is_standard
         return TABLE_2.get((*self.place, self.method)) if comparable else None
 
     def returns(self, mode: str = "deterministic") -> list[float]:
@@ -105,9 +106,9 @@ class Cell:
         return self.runs[0].state
 
     @property
-    def measures(self) -> dict[str, float]:
-        """Means over seeds of what else the task measures of deterministic episodes, terms of the reward aside."""
-        return shared_means([run.evaluation["deterministic"].get("measures", {}) for run in self.complete], "reward_")
+    def metrics(self) -> dict[str, float]:
+        """Means over seeds of the metrics of deterministic episodes, without the terms of the reward."""
+        return shared_means([run.evaluation["deterministic"].get("metrics", {}) for run in self.complete], "reward_")
 
     @property
     def remarks(self) -> list[str]:
@@ -136,11 +137,14 @@ class Ablation:
 
 
 def choices(run: Run) -> dict[str, Any]:
-    """Settings that have a name of their own in the paper or the command line, None where a method has none such."""
+    """Settings that have a name of their own in the paper or the command line, and those by which the method is known.
+
+    They are None where a method has none such.
+    """
     settings = run.settings
     transfers = run.stage == "transfer" and "primitives" in settings.get("transfer.keep", ())
     trained = "gate" if "primitives" in settings.get("transfer.freeze", ()) else "gate and primitives"
-    return {
+    named = {
         "preset": run.preset,
         "total_frames": run.total_frames,
         "num_primitives": settings.get("num_primitives"),
@@ -151,14 +155,15 @@ def choices(run: Run) -> dict[str, Any]:
         "exploration": settings.get("exploration.name"),
         "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
     }
+    return named | {name: settings.get(name) for name in run.standard if name not in named}
 
 
 def cells(runs: Iterable[Run]) -> list[Cell]:
     """Group runs into cells, in the paper's order of tasks, stages and methods.
 
     Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or, where these are
-    alike, any other value of their configuration, :data:`BOOKKEEPING` aside. Commits do not part them: a cell remarks
-    on them.
+    alike, any other value of their configuration that :mod:`~torchrl_mcp.runs.identity` counts. Commits do not part
+    them: a cell remarks on them.
     """
     found = []
     for alike in _grouped(runs, lambda run: (run.place, run.stage, run.method)).values():
@@ -166,6 +171,11 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
         for chosen in _grouped(alike, lambda run: _frozen(choices(run))).values():
             found += _cells(chosen, telling)
     return sorted(found, key=_order)
+
+
+def methods(cells: Iterable[Cell]) -> dict[str, str]:
+    """Return the titles of methods by their names: those of Table 2 in its order, then others by the alphabet."""
+    return {cell.method: cell.title for cell in sorted(cells, key=lambda cell: _rank(cell.method, METHODS))}
 
 
 def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
@@ -185,16 +195,16 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
     """Return what differs between cells beside their methods, and may be why they differ in their results."""
     runs = [run for cell in cells for run in cell.runs]
     steps = {
-        method: sorted({run.total_frames for run in group})
-        for method, group in _grouped(runs, lambda run: run.method).items()
+        title: sorted({run.total_frames for run in group})
+        for title, group in _grouped(runs, lambda run: run.title).items()
     }
     return [
         *_mixed("presets", (run.preset for run in runs)),
         *_mixed("commits", (run.commit for run in runs)),
         *_mixed("evaluations", (_protocol(run) for run in runs if run.state == "complete")),
         *(
-            f"steps of {METHODS.get(method, method)}: {', '.join(f'{total:,}' for total in totals)}"
-            for method, totals in steps.items()
+            f"steps of {title}: {', '.join(f'{total:,}' for total in totals)}"
+            for title, totals in steps.items()
             if len(totals) > 1
         ),
     ]
@@ -207,7 +217,7 @@ def over_tasks(cells: Iterable[Cell]) -> tuple[list[tuple[str, str]], dict[str, 
     """
     scores: dict[str, dict[tuple[str, str], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     for cell in cells:
-        if cell.stage == "transfer" and cell.is_papers and cell.complete:
+        if cell.stage == "transfer" and cell.is_standard and cell.complete:
             scores[cell.method][cell.place].append(cell.returns())
     single = {m: {p: r[0] for p, r in places.items() if len(r) == 1} for m, places in scores.items()}
     shared = [place for place in PLACES if all(place in places for places in single.values())]
@@ -223,7 +233,7 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
     for alike in _grouped(runs, lambda run: _frozen(_learned(run), others)).values():
         first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
         settings = {name: named[name] for name in telling if named[name] is not None}
-        settings |= {name: learned[name] for name in others}
+        settings |= {name: learned.get(name, DEFAULT) for name in others}
         by_seed = sorted(alike, key=lambda run: run.seed)
         found.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
     return found
@@ -232,22 +242,24 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
 def _learned(run: Run) -> dict[str, Any]:
     """What of a run's configuration may change what it learns."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
-    ignored = (*BOOKKEEPING, other_stage)
-    return {
-        name: value
-        for name, value in run.settings.items()
-        if not any(name == prefix or name.startswith(f"{prefix}.") for prefix in ignored)
-    }
+    ignored = UNLEARNT | {other_stage}
+    return {name: value for name, value in run.settings.items() if not is_among(name, ignored)}
 
 
 def _varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names that all have, with more than one value."""
-    names = [name for name in settings[0] if all(name in other for other in settings)]
-    return [name for name in names if len({repr(other[name]) for other in settings}) > 1]
+    """Names with more than one value. What some lack counts where it is an argument, which has a default then."""
+    names = dict.fromkeys(name for one in settings for name in one)
+    shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
+    return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
+
+
+def _target(name: str) -> str:
+    """Name of the setting that says of what a setting would be an argument."""
+    return f"{name.rpartition('.')[0]}._target_"
 
 
 def _frozen(settings: Mapping[str, Any], names: Iterable[str] | None = None) -> Hashable:
-    return tuple((name, repr(settings[name])) for name in (settings if names is None else names))
+    return tuple((name, repr(settings.get(name, DEFAULT))) for name in (settings if names is None else names))
 
 
 def _grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
@@ -258,11 +270,12 @@ def _grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, lis
 
 
 def _order(cell: Cell) -> tuple:
-    def rank(value: Any, known: Sequence[Any]) -> tuple[int, Any]:
-        return (list(known).index(value), "") if value in known else (len(known), value)
-
     variants = tuple((name, repr(value).rjust(20)) for name, value in cell.settings.items())
-    return rank(cell.place, PLACES), cell.stage, rank(cell.method, list(METHODS)), not cell.is_papers, variants
+    return _rank(cell.place, PLACES), cell.stage, _rank(cell.method, METHODS), not cell.is_standard, variants
+
+
+def _rank(value: Any, known: Sequence[Any]) -> tuple[int, Any]:
+    return (known.index(value), "") if value in known else (len(known), value)
 
 
 def _standing(run: Run) -> str:

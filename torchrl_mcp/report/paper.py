@@ -1,11 +1,11 @@
-"""What the paper reports, to set beside our own figures.
+"""The paper's results, which the report shows beside ours.
 
 Reference:
     Peng et al., "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies", NeurIPS
     2019, https://arxiv.org/abs/1905.09808
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Reported(NamedTuple):
@@ -15,16 +15,8 @@ class Reported(NamedTuple):
     std: float
 
 
-METHODS = {
-    "scratch": "Scratch",
-    "finetune": "Finetune",
-    "hierarchical": "Hierarchical",
-    "option_critic": "Option-Critic",
-    "moe": "MOE",
-    "latent_space": "Latent Space",
-    "mcp": "MCP",
-}
-"""Names of the methods, in the order of Table 2."""
+METHODS = ("scratch", "finetune", "hierarchical", "option_critic", "moe", "latent_space", "mcp")
+"""Columns of Table 2."""
 
 CHARACTERS = {"biped": "Biped", "humanoid": "Humanoid", "trex": "T-Rex", "ant": "Ant"}
 
@@ -74,12 +66,3 @@ TABLE_2 = {
 
 PLACES = list(_ROWS)
 """Pairs of task and character, in the order of Table 2."""
-
-SETTINGS: dict[str, dict[str, Any]] = {
-    "mcp": {"num_primitives": 8, "mixer": "multiplicative", "trained": "gate"},
-    "moe": {"num_primitives": 8, "mixer": "additive", "trained": "gate"},
-    "hierarchical": {"num_primitives": 7},
-    "option_critic": {"num_options": 8},
-    "latent_space": {"latent_dim": 8},
-}
-"""By which Table 2's methods are told from their variants (Tables 5, 8-11, Section 3)."""

@@ -1,4 +1,4 @@
-"""What run folders say of themselves: configuration, progress, evaluation and origin."""
+"""The contents of run folders: configuration, progress, evaluation and provenance."""
 
 import csv
 import json
@@ -6,15 +6,18 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, ORIGIN
+from torchrl_mcp.runs import build
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
@@ -49,7 +52,7 @@ class Run:
         seconds: Wall time of them.
         has_episodes: Whether an episode has ended, so that there is a learning curve.
         evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
-        origin: Commit, choices and machine of its beginning; empty of older runs.
+        provenance: Commit, choices and machine of its beginning; empty of older runs.
         fault: What is wrong with its files, or None.
     """
 
@@ -59,7 +62,7 @@ class Run:
     seconds: float = 0.0
     has_episodes: bool = False
     evaluation: Mapping[str, Any] = field(default_factory=dict)
-    origin: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
     fault: str | None = None
 
     @property
@@ -71,6 +74,17 @@ class Run:
     def method(self) -> str:
         """Name of the method."""
         return self.settings["method.name"]
+
+    @property
+    def title(self) -> str:
+        """Title of the method."""
+        return self.settings.get("method.title", self.method)
+
+    @property
+    def standard(self) -> dict[str, Any]:
+        """Settings by which the method is known."""
+        prefix = "method.standard."
+        return {name.removeprefix(prefix): x for name, x in self.settings.items() if name.startswith(prefix)}
 
     @property
     def stage(self) -> str:
@@ -90,12 +104,12 @@ class Run:
     @property
     def preset(self) -> str:
         """Preset of its settings, ``unknown`` of runs that did not note it."""
-        return self.origin.get("choices", {}).get("preset", "unknown")
+        return self.provenance.get("choices", {}).get("preset", "unknown")
 
     @property
     def commit(self) -> str:
         """Commit of the library that it began with, ``unknown`` of runs that did not note it."""
-        return self.origin.get("commit") or "unknown"
+        return self.provenance.get("commit") or "unknown"
 
     @property
     def progress(self) -> float:
@@ -142,9 +156,11 @@ def read_run(folder: Path) -> Run | Damaged:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
     if (total := settings["training.total_frames"]) < 1:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
+    if "method.title" not in settings:  # the run is older than what methods tell about themselves
+        settings = dict(_leaves(_about(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
-    for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (ORIGIN, _origin)):
+    for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
         try:
             contents |= read(folder)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
@@ -153,8 +169,8 @@ def read_run(folder: Path) -> Run | Damaged:
 
 
 def _run_folders(path: Path) -> Iterator[Path]:
-    for folder, subfolders, files in os.walk(path):
-        if CONFIG in files or METRICS in files:
+    for folder, subfolders, names in os.walk(path):
+        if CONFIG in names or METRICS in names:
             subfolders.clear()
             yield Path(folder)
         subfolders[:] = [name for name in subfolders if not name.startswith(".")]
@@ -191,15 +207,24 @@ def _evaluation(folder: Path) -> dict[str, Any]:
     return {"evaluation": content}
 
 
-def _origin(folder: Path) -> dict[str, Any]:
-    if not (folder / ORIGIN).exists():
+def _provenance(folder: Path) -> dict[str, Any]:
+    if not (folder / PROVENANCE).exists():
         return {}
-    content = json.loads((folder / ORIGIN).read_text())
+    content = json.loads((folder / PROVENANCE).read_text())
     content.get("choices", {}).get("preset")
-    return {"origin": content}
+    return {"provenance": content}
 
 
 def _line(error: Exception) -> str:
     """The first line of an error's message."""
     message = str(error).partition("\n")[0] or type(error).__name__
     return f"it lacks {message}" if isinstance(error, KeyError) else message
+
+
+@cache
+def _about(method: str) -> dict[str, Any]:
+    """Return what the library's method of a name tells about itself, or nothing of a method that it does not have."""
+    known = files("torchrl_mcp.conf").joinpath("method").iterdir()
+    if f"{method}.yaml" not in {file.name for file in known}:
+        return {}
+    return cast("dict[str, Any]", OmegaConf.to_container(build.compose_run(f"method={method}").method, resolve=True))

@@ -6,18 +6,14 @@ from itertools import cycle
 from typing import Any
 
 from torchrl_mcp.analysis.curves import learning_curves, plot_curves
-from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, new_figure
-from torchrl_mcp.report.comparison import Cell, ablations, caveats
-from torchrl_mcp.report.paper import CHARACTERS, METHODS, SETTINGS
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, colours, new_figure
+from torchrl_mcp.report.comparison import Cell, ablations, caveats, methods
+from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.report.svg import inline_svg
 from torchrl_mcp.report.usage import diagnostics, usage, verdict
 
 LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS, start=1)}
 PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
-
-METHOD_COLOURS = dict(
-    zip(("mcp", "scratch", "latent_space", "finetune", "hierarchical", "option_critic", "moe"), COLOURS, strict=True)
-)
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
 """Kinds of lines of matplotlib, and their like in SVG."""
@@ -117,9 +113,9 @@ class Section:
         return found
 
     @property
-    def measures(self) -> list[str]:
-        """Names of what the task measures."""
-        return list(dict.fromkeys(name for row in self.rows for name in row.cell.measures))
+    def metrics(self) -> list[str]:
+        """Names of the metrics of the task."""
+        return list(dict.fromkeys(name for row in self.rows for name in row.cell.metrics))
 
     @property
     def has_reported(self) -> bool:
@@ -148,20 +144,21 @@ def place_title(place: tuple[str, str]) -> str:
     return f"{task.capitalize()}: {CHARACTERS.get(character, character)}"
 
 
-def method_title(method: str) -> str:
-    """Return a method's name in the paper, if it has one."""
-    return METHODS.get(method, method)
+def method_colours(cells: Sequence[Cell]) -> dict[str, str]:
+    """Return colours of methods by their names."""
+    named = methods(cells)
+    return dict(zip(named, colours(len(named)), strict=True))
 
 
 def row(cell: Cell) -> Row:
-    """Return a cell under the name of its method; settings as in the paper go without saying."""
-    papers = SETTINGS.get(cell.method, {})
-    telling = {name: value for name, value in cell.settings.items() if name not in papers or value != papers[name]}
+    """Return a cell under the title of its method; settings by which the method is known go without saying."""
+    standard = cell.runs[0].standard
+    telling = {name: value for name, value in cell.settings.items() if name not in standard or value != standard[name]}
     words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in telling.items())
-    return Row(cell, method_title(cell.method), ", ".join(words))
+    return Row(cell, cell.title, ", ".join(words))
 
 
-def task_sections(cells: Sequence[Cell], names: Iterator[str]) -> list[Section]:
+def task_sections(cells: Sequence[Cell], names: Iterator[str], palette: Mapping[str, str]) -> list[Section]:
     """Return a section per task and character, as in Figures 4 and 9.
 
     The table has all cells; the plot leaves out those that an ablation shows.
@@ -169,13 +166,15 @@ def task_sections(cells: Sequence[Cell], names: Iterator[str]) -> list[Section]:
     Args:
         cells: Cells of one stage.
         names: Names for plots.
+        palette: Colours of methods by their names.
     """
     ablated = {id(cell) for setting in ABLATIONS for part in ablations(cells, setting) for cell in part.cells}
     sections = []
     for place in dict.fromkeys(cell.place for cell in cells):
         rows = [row(cell) for cell in cells if cell.place == place]
-        drawn = [r for r in rows if r.cell.is_papers or id(r.cell) not in ablated]
-        sections.append(Section(place_title(place), rows, plot(place_title(place), drawn, _styles(drawn), next(names))))
+        drawn = [r for r in rows if r.cell.is_standard or id(r.cell) not in ablated]
+        title = place_title(place)
+        sections.append(Section(title, rows, plot(title, drawn, _styles(drawn, palette), next(names))))
     return sections
 
 
@@ -186,9 +185,9 @@ def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapt
         sections = []
         for part in ablations(cells, setting):
             first = part.cells[0]
-            heading = f"{place_title(first.place)}, {method_title(first.method)}, {first.stage}"
+            heading = f"{place_title(first.place)}, {first.title}, {first.stage}"
             rows = [Row(cell, SETTING_WORDS[setting].format(cell.choices[setting])) for cell in part.cells]
-            styles = [{"color": colour, "linestyle": "-"} for colour, _ in zip(cycle(COLOURS), rows, strict=False)]
+            styles = [{"color": colour, "linestyle": "-"} for colour in colours(len(rows))]
             drawn = plot(f"{title}, {heading}", rows, styles, next(names))
             sections.append(Section(heading, rows, drawn, kind="Setting"))
         if sections:
@@ -239,9 +238,9 @@ def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], n
     return Plot(svg, lines, [label for paths, label, _ in groups if not paths])
 
 
-def _styles(rows: Sequence[Row]) -> Iterator[dict[str, str]]:
-    """A colour per method, and a kind of line per variant of it."""
+def _styles(rows: Sequence[Row], palette: Mapping[str, str]) -> Iterator[dict[str, str]]:
+    """A colour per method; another kind of line for each variant, and for a method whose colour is taken."""
     kinds: dict[str, Iterator[str]] = {}
     for r in rows:
-        kind = next(kinds.setdefault(r.cell.method, cycle(DASHES)))
-        yield {"color": METHOD_COLOURS.get(r.cell.method, COLOURS[-1]), "linestyle": kind}
+        colour = palette[r.cell.method]
+        yield {"color": colour, "linestyle": next(kinds.setdefault(colour, cycle(DASHES)))}

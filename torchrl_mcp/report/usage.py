@@ -1,11 +1,11 @@
-"""What evaluations say of gates and options: do the primitives share the work?"""
+"""Usage of gates and options in evaluations: do the primitives share the work?"""
 
 import math
 
 from torchrl_mcp.evaluation.diagnostics import COLLAPSED
+from torchrl_mcp.evaluation.statistics import shared_means
 from torchrl_mcp.report.comparison import Cell
 from torchrl_mcp.report.results import Run
-from torchrl_mcp.report.statistics import shared_means
 
 WIDE_OPEN = 0.95
 """Mean weight from which the gates no longer choose: the composite is then the product of all primitives."""

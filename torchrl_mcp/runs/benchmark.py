@@ -13,32 +13,26 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import initialize_config_module
-from hydra._internal.callbacks import Callbacks
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.experimental.callback import Callback
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import experiment, lock
-from torchrl_mcp.training.run_folder import CONFIG, LOG
+from torchrl_mcp.runs import build, experiment, lock
+from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
+from torchrl_mcp.training.run_folder import CONFIG, LOG
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
-TRANSFER_ONLY = {"budget.scratch", "budget.transfer", "exploration", "pretrained", "transfer.freeze", "transfer.keep"}
-"""Settings that make no difference to pre-training, or that it refuses."""
-INDIFFERENT = {"checkpoint_interval", "collector", "device", "keep_checkpoints", "logger", "num_threads",
-               "progress_bar", "resume", "torch_threads"}  # fmt: skip
-"""Settings that may differ from those that a run began with."""
-LEFT_OPEN = {"autocast": "auto"}
-"""Values that leave a setting to the machine, so that any value agrees with them."""
 
 Settings = Mapping[str, str]
 
@@ -76,7 +70,7 @@ def main(arguments: Sequence[str]) -> None:
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         master = hydra.compose_config("train", [*QUIET, *arguments], RunMode.MULTIRUN, with_log_configuration=False)
-        context = HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(master))
+        context = HydraContext(config_loader=hydra.config_loader, callbacks=cast("Any", Callback()))
         jobs = plan(master, hydra.config_loader)
         if conflicts := [line for job in jobs if (line := conflict(job))]:
             raise ValueError("\n".join(["nothing was started, for there are runs of other settings:", *conflicts]))
@@ -94,9 +88,9 @@ def main(arguments: Sequence[str]) -> None:
 def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     """Return all runs of the benchmark ``master.benchmark`` as the command line has it, pre-training first.
 
-    An argument of the command line that rows have as well, such as ``task=heading``, selects rows; any other sets or
-    sweeps a setting of all runs. A run whose method keeps something transfers from the pre-training of the same
-    settings, which others may share.
+    An argument of the command line that rows have as well, such as ``task=heading``, selects rows; any other sets a
+    setting of all runs, to one value or to several. A run whose method keeps something transfers from the pre-training
+    of the same settings, which others may share.
 
     Raises:
         ValueError: If there are none, or two of different settings would share a folder.
@@ -155,7 +149,7 @@ def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None
     kept = {
         key: value
         for key, value in settings.items()
-        if key not in TRANSFER_ONLY and (name == task["name"] or not key.startswith("task."))
+        if key not in TRANSFER_ONLY and (name == task["name"] or not key.lstrip("+").startswith("task."))
     }
     return {**kept, "task": name, "stage": "pretrain"} | ({} if seed is None else {"seed": str(seed)})
 
@@ -168,6 +162,7 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     HydraConfig.instance().set_config(cfg)  # for what refers to it
     with read_write(cfg), open_dict(cfg):
         del cfg["hydra"]
+    build.require_environment(cfg)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     HydraConfig.instance().cfg = former
     return Job(Path(config["run_dir"]), overrides, config)
@@ -193,17 +188,10 @@ def conflict(job: Job) -> str | None:
     """Return what keeps a job from its folder, if anything."""
     if not (job.folder / CONFIG).exists():
         return None
-    held: Any = OmegaConf.to_container(experiment.configuration(job.folder), resolve=True)
+    held: Any = OmegaConf.to_container(experiment.run_config(job.folder), resolve=True)
     if not (changed := differences(held, job.config)):
         return None
     return f"{job.folder} differs in {', '.join(changed)}: delete it, or choose another run_root"
-
-
-def differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Return the settings that make two runs differ."""
-    indifferent = INDIFFERENT | {key for key, value in LEFT_OPEN.items() if wanted.get(key) == value}
-    keys = dict.fromkeys([*held, *wanted])
-    return [key for key in keys if key not in indifferent and held.get(key) != wanted.get(key)]
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:

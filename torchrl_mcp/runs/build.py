@@ -1,23 +1,30 @@
-"""From a configuration to environments, an agent and its trainer."""
+"""From a configuration to environments, an agent and its trainer: the library's door to Hydra."""
 
-from collections.abc import Sequence
+import inspect
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from hydra.utils import instantiate
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Compose
+from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp.training import checkpoint
-from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.trainer import Trainer
 from torchrl_mcp.training.transfer import FrozenParts, require_parts
@@ -33,17 +40,68 @@ class Agent:
     frozen: FrozenParts
 
 
+def require_environment(cfg: DictConfig) -> None:
+    """Check that there is an environment for the configured task, stage and character.
+
+    Raises:
+        ValueError: If there is none, or the configuration names what this version does not have.
+    """
+    task, character = cfg.task.name, cfg.character.name
+    if cfg.stage.name not in cfg.task:
+        raise ValueError(
+            f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
+            f"task={task} with stage=transfer and pretrained=<folder of the pre-training>"
+        )
+    # The motions of a character of your own may be what introduces it, so all that is named is imported.
+    named = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
+    environment, *_ = [get_object(name) for name in named]
+    able: tuple[str, ...] = getattr(environment, "characters", tuple)()
+    if able and character not in able:
+        known = " or ".join(able)
+        raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+
+
+def require_known(config: Mapping[str, Any], source: Path) -> None:
+    """Check that everything is there that the configuration of a run names.
+
+    Args:
+        config: The configuration.
+        source: The file that holds it.
+
+    Raises:
+        ValueError: If something is not.
+    """
+    for name in targets(config):
+        if _exists(name):
+            continue
+        if name.startswith("torchrl_mcp."):
+            raise ValueError(
+                f"{source} is of another version of torchrl-mcp: it names {name}, which this version does not have. "
+                "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
+            )
+        raise ValueError(
+            f"{source} names {name}, which Python does not find: if the module is yours, add its folder to PYTHONPATH"
+        )
+
+
+def targets(config: Any) -> Iterator[str]:
+    """Yield the name of everything that a configuration makes, from the top."""
+    if isinstance(config, Mapping):
+        if isinstance(name := config.get("_target_"), str):
+            yield name
+    elif not isinstance(config, list):
+        return
+    for item in config.values() if isinstance(config, Mapping) else config:
+        yield from targets(item)
+
+
 def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
     """Return the environments of the configured task and stage, with the transforms that the method needs, if any.
 
     Raises:
-        ValueError: If the task has no such stage.
+        ValueError: As :func:`require_environment`.
     """
-    if cfg.stage.name not in cfg.task:
-        raise ValueError(
-            f"task={cfg.task.name} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
-            f"task={cfg.task.name} with stage=transfer and pretrained=<folder of the pre-training>"
-        )
+    require_environment(cfg)
     settings = {"num_threads": cfg.num_threads, **kwargs}
     env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, **settings)
     if not (transforms := instantiate(cfg.get("transforms", []))):
@@ -82,7 +140,7 @@ def make_source(cfg: DictConfig) -> TrajectorySource:
 
 
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:
-    """Return the trainer of an agent; ``cfg.autocast`` is true or false, as :mod:`~torchrl_mcp.training.precision` chose.
+    """Return the trainer of an agent; ``cfg.autocast`` is true or false, what :func:`.precision.choose` chose.
 
     A method whose samples last for several steps, such as choices, names a ``batch_factor`` by which its batches are
     larger than ``training.frames_per_batch``.
@@ -93,7 +151,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         "critic": list(agent.parts["critic"].parameters()),
     }
     optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
-    loss = instantiate(cfg.objective.loss)(agent.actor.trained, agent.critic)
+    loss = instantiate(cfg.objective.loss)(agent.actor.trained, None)
     loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
     training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
     training["frames_per_batch"] *= cfg.get("batch_factor", 1)
@@ -102,7 +160,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         parts=agent.parts,
         actor=agent.actor,
         critic=agent.critic,
-        loss=loss,
+        losses={"actor": loss, "critic": instantiate(cfg.objective.value_loss)(agent.critic)},
         advantages=instantiate(cfg.objective.advantages)(agent.critic),
         optimizers=optimizers,
         frozen=agent.frozen,
@@ -117,3 +175,46 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         progress_bar=cfg.progress_bar,
         **training,
     )
+
+
+def make_loggers(cfg: DictConfig) -> list[Logger]:
+    """Return the configured logger, if any."""
+    return [instantiate(cfg.logger)] if cfg.logger else []
+
+
+def compose_run(*overrides: str) -> DictConfig:
+    """Return the configuration that a command with these arguments would run."""
+    begun = GlobalHydra.instance().is_initialized()  # on the command line
+    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+def launched() -> tuple[list[str], dict[str, str]]:
+    """Return the command line and the choices of the run that Hydra has launched, or those of this process."""
+    if not HydraConfig.initialized():
+        return list(sys.argv), {}
+    hydra = HydraConfig.get()
+    made = hydra.runtime.choices.items()
+    choices = {group: choice for group, choice in made if choice and not group.startswith("hydra/")}
+    return ["torchrl-mcp-train", *hydra.overrides.task], choices
+
+
+def arguments(name: str) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a class or function by name, with those that a class passes on to its bases."""
+    made = get_object(name)
+    kinds = made.__mro__ if inspect.isclass(made) else ()
+    found: dict[str, inspect.Parameter] = {}
+    for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
+        parameters = inspect.signature(maker).parameters
+        found = {**parameters, **found}
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    return found
+
+
+def _exists(name: str) -> bool:
+    try:
+        get_object(name)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    return True

@@ -2,33 +2,27 @@
 
 import json
 import math
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
-from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp.training import checkpoint
-from torchrl_mcp.evaluation.clips import ClipResult, follow_each
-from torchrl_mcp.runs.build import Agent, make_agent, make_source, make_env, make_trainer
-from torchrl_mcp.runs.builtin import builtin, publish
-from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.evaluation.rollout import evaluate, summary
+from torchrl_mcp.evaluation.clips import ClipResult, follow_each
+from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs.provenance import machine, origin
+from torchrl_mcp.runs import build
+from torchrl_mcp.runs.build import Agent, make_agent, make_env, make_source, make_trainer
+from torchrl_mcp.runs.builtin import builtin, publish
+from torchrl_mcp.runs.machine import machine
+from torchrl_mcp.runs.provenance import provenance
+from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.precision import choose, name
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, ORIGIN
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, replacing, write_json
 from torchrl_mcp.training.trainer import Trainer
-
-USUAL = ("collector", "evaluation")
-"""Settings that not all runs had from the beginning."""
 
 
 def train(cfg: DictConfig) -> Path:
@@ -37,20 +31,23 @@ def train(cfg: DictConfig) -> Path:
     The folder's configuration holds the precision that was chosen, where ``cfg.autocast`` leaves it to the machine.
 
     Raises:
-        ValueError: If the folder holds a run already, or the configuration lacks the checkpoint to transfer from.
+        ValueError: If the folder holds a run already, there is no environment for the configured task and character, or
+            the configuration lacks the checkpoint to transfer from.
     """
     folder = Path(cfg.run_dir)
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    build.require_environment(cfg)
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
     print(f"{folder}: {precision}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
     trainer = _trainer(cfg, folder, pretrained)
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
-    _write(origin(cfg.device, precision), folder / ORIGIN)
+    write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)
     # Last, because it is what says that there is a run to resume.
-    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    with replacing(folder / CONFIG) as partial:
+        OmegaConf.save(cfg, partial, resolve=True)
     _finish(trainer, cfg, folder)
     return folder
 
@@ -65,7 +62,7 @@ def resume(folder: Path) -> Path:
     """
     if is_complete(folder):
         return folder
-    cfg, newest = configuration(folder), checkpoint.find(folder)
+    cfg, newest = run_config(folder), checkpoint.find(folder)
     print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
     if checkpoint.frames(newest):
         trainer = _trainer(cfg, folder)
@@ -78,19 +75,32 @@ def resume(folder: Path) -> Path:
     return folder
 
 
-def configuration(folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder``; if it is from before ``USUAL``, they are as in a new run.
+def run_config(folder: Path) -> DictConfig:
+    """Return the configuration of the run in ``folder``.
 
     Raises:
-        ValueError: If the folder holds no run.
+        ValueError: If the folder holds no run, or one of another version of the library.
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
-    if missing := [key for key in USUAL if key not in cfg]:
-        usual = _usual(cfg.task.name)
-        cfg.update({key: usual[key] for key in missing})
+    build.require_known(cast("dict[str, Any]", OmegaConf.to_container(cfg)), folder / CONFIG)
     return cfg
+
+
+def policy_config(path: Path) -> DictConfig:
+    """Return the configuration with which a policy was trained.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or of another version of the library.
+    """
+    file = checkpoint.find(path)
+    config = checkpoint.saved_config(file)
+    build.require_known(config, file)
+    return OmegaConf.create(dict(config))
 
 
 def is_complete(folder: Path) -> bool:
@@ -99,7 +109,7 @@ def is_complete(folder: Path) -> bool:
     Raises:
         ValueError: If the folder holds no run.
     """
-    cfg = configuration(folder)
+    cfg = run_config(folder)
     trained = checkpoint.frames(checkpoint.find(folder)) >= cfg.training.total_frames
     return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
 
@@ -118,10 +128,10 @@ def restore(
         **kwargs: Arguments of the environments that replace the run's own.
 
     Raises:
-        ValueError: If there is no checkpoint or it is damaged.
+        ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
     """
     file = checkpoint.find(path)
-    cfg = OmegaConf.create(dict(checkpoint.configuration(file)))
+    cfg = policy_config(file)
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
     agent = make_agent(cfg, env)
@@ -160,17 +170,17 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
     Raises:
         ValueError: If there is no checkpoint or it is damaged.
     """
-    cfg = OmegaConf.create(dict(checkpoint.configuration(checkpoint.find(path))))
-    settings: Any = OmegaConf.to_container(cfg.get("evaluation") or _usual(cfg.task.name)["evaluation"], resolve=True)
+    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     environment = settings["environment"]
     numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
     return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
 
 
 def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
-    """Return the :func:`~torchrl_mcp.evaluation.rollout.summary` of a run's policy, ``deterministic`` and ``stochastic``.
+    """Return how a run's policy did, ``deterministic`` and ``stochastic``.
 
-    Each has the :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+    Each is the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics` of the episodes, with the
+    :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
     Args:
         path: Run folder, of which the newest checkpoint counts, or checkpoint file.
@@ -187,7 +197,7 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
         torch.manual_seed(seed)
         record = diagnosed(agent.actor)
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
-        results[mode] = summary(outcome, env.normalised_return)
+        results[mode] = episode_statistics(outcome, env.normalised_return)
         results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
     return results
 
@@ -222,7 +232,7 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
 def _precision_kept(cfg: DictConfig, folder: Path) -> str:
     """Return in which precision a run goes on, and whether it began on another machine."""
     precision = name(choose(cfg.autocast, cfg.device).autocast)
-    began = json.loads((folder / ORIGIN).read_text())["machine"] if (folder / ORIGIN).is_file() else {}
+    began = json.loads((folder / PROVENANCE).read_text())["machine"] if (folder / PROVENANCE).is_file() else {}
     now = machine(cfg.device)
     if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
         return f"goes on with networks in {precision}"
@@ -234,30 +244,11 @@ def _precision_kept(cfg: DictConfig, folder: Path) -> str:
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     """Train to the end and evaluate what came of it."""
-    trainer.metrics_writer.loggers = _loggers(cfg)
+    trainer.metrics_writer.loggers = build.make_loggers(cfg)
     trainer.run()
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
-        _write(numbers, folder / EVALUATION)
-
-
-def _usual(task: str) -> dict[str, DictConfig]:
-    """Return what a new run on a task has of ``USUAL``."""
-    begun = GlobalHydra.instance().is_initialized()  # on the command line
-    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [f"task={task}"])
-        return {key: cfg[key] for key in USUAL}
-
-
-def _write(content: dict[str, Any], path: Path) -> None:
-    """Write a JSON file that is whole if it is there."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(content, indent=2) + "\n")
-    part.replace(path)
-
-
-def _loggers(cfg: DictConfig) -> list[Logger]:
-    return [instantiate(cfg.logger)] if cfg.logger else []
+        write_json(numbers, folder / EVALUATION)
 
 
 def _pretrained(cfg: DictConfig) -> Path | None:

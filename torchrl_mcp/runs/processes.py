@@ -1,4 +1,4 @@
-"""Functions side by side, each in a process of its own."""
+"""Functions that run side by side, each in its own process."""
 
 import multiprocessing
 import os

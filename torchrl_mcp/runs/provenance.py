@@ -1,48 +1,38 @@
-"""Where a run comes from: command, code, choices and machine."""
+"""The provenance of a run: command, code, choices and machine."""
 
-import os
-import platform
 import shutil
 import subprocess
-import sys
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
-from hydra.core.hydra_config import HydraConfig
-
 from torchrl_mcp import __version__
+from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.training.precision import Precision
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def origin(device: str, precision: Precision) -> dict[str, Any]:
-    """Return what a run on ``device`` should remember of its beginning, JSON-compatible.
+def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision) -> dict[str, Any]:
+    """Return where a run comes from, JSON-compatible.
 
     Args:
         device: Where its networks are.
-        precision: What they compute in.
+        command: The words of the command that began it.
+        choices: The choice of each group of its configuration.
+        precision: What its networks compute in.
 
     Returns:
-        ``command`` as a list of words; ``commit`` of the library, with ``-dirty`` where files were changed since, or
-        None where it is no checkout; its ``version``; ``choices``, the choice of each group of the configuration,
-        where Hydra runs; ``precision`` of the networks and the reason for it; ``started``, an ISO time; and the
+        ``command``; ``commit`` of the library, with ``-dirty`` where files were changed since, or None where it is no
+        checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``started``, an ISO time; and the
         ``machine``.
     """
-    command, choices = list(sys.argv), {}
-    if HydraConfig.initialized():
-        hydra = HydraConfig.get()
-        command = ["torchrl-mcp-train", *hydra.overrides.task]
-        made = hydra.runtime.choices.items()
-        choices = {group: choice for group, choice in made if choice and not group.startswith("hydra/")}
     return {
-        "command": command,
+        "command": list(command),
         "commit": commit(PACKAGE),
         "version": __version__,
-        "choices": choices,
+        "choices": dict(choices),
         "precision": str(precision),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(device),
@@ -57,28 +47,6 @@ def commit(folder: Path) -> str | None:
     if not _git(folder, "ls-files", "."):
         return None
     return _git(folder, "describe", "--always", "--dirty", "--exclude=*")
-
-
-def machine(device: str) -> dict[str, Any]:
-    """Return processor, cores, device and the versions of all that makes numbers."""
-    libraries = {name: version(name) for name in ("torch", "torchrl", "mujoco")}
-    on_gpu = torch.device(device).type == "cuda"
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "device": torch.cuda.get_device_name(device) if on_gpu else device,
-        "python": platform.python_version(),
-        **libraries,
-    }
-
-
-def _processor() -> str:
-    description = Path("/proc/cpuinfo")
-    if description.exists():
-        for line in description.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

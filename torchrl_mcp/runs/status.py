@@ -1,6 +1,6 @@
-"""How far are the runs of a folder?
+"""The progress of the runs of a folder.
 
-Everything is read from the run folders, so it works beside a sweep in any process on any machine that shares them.
+Everything is read from the run folders, so it works beside a benchmark in any process on any machine that shares them.
 """
 
 import csv
@@ -22,7 +22,8 @@ from rich.live import Live
 from rich.table import Table
 
 from torchrl_mcp.runs import lock
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS
+from torchrl_mcp.runs.tables import plain_table
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, write_json
 
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
@@ -35,7 +36,7 @@ Runs = Mapping[Path, int | None]
 
 @dataclass(frozen=True)
 class Status:
-    """How far a run is.
+    """The progress of a run.
 
     Attributes:
         folder: Its run folder.
@@ -93,9 +94,8 @@ def look(folder: Path, runs: Runs | None = None) -> list[Status]:
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
     """Write down which runs a benchmark has and how many steps each takes, for those who look on."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
-    path.write_text(json.dumps(steps, indent=2) + "\n")
+    write_json(steps, path)
 
 
 def read_manifest(path: Path) -> dict[Path, int]:
@@ -125,7 +125,7 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
     rows = sorted(statuses, key=lambda one: order.index(one.state))
     shown = rows if height is None or len(rows) <= height else rows[: max(height, 1)]
     hidden = f"; {len(rows) - len(shown)} not shown" if len(shown) < len(rows) else ""
-    result = Table(caption=_count(statuses) + hidden, caption_justify="left", box=None, padding=(0, 2, 0, 0))
+    result = plain_table(_count(statuses) + hidden)
     result.add_column("run", overflow="fold")
     result.add_column("state")
     for name in ("steps", "steps/s", "return", "left"):

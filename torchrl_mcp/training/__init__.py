@@ -1,1 +1,1 @@
-"""The training loop, and what it writes: metrics and checkpoints."""
+"""The training loop, its trajectory sources, metrics and checkpoints."""

@@ -96,7 +96,7 @@ def frames(path: Path) -> int:
     return int(path.stem.rpartition("-")[2])
 
 
-def configuration(path: Path) -> Mapping[str, Any]:
+def saved_config(path: Path) -> Mapping[str, Any]:
     """Return the configuration of the run that wrote the checkpoint file ``path``.
 
     Raises:

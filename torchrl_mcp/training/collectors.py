@@ -1,7 +1,6 @@
-"""Where trajectories come from: environments in this process, or in workers on one machine or on many."""
+"""Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -16,12 +15,13 @@ from torchrl.collectors import Collector
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training.progress import Stopwatch
+from torchrl_mcp.training.threads import threads
 
 Environments = CharacterEnv | TransformedCharacterEnv
 
 
 class TrajectorySource(Protocol):
-    """What the trainer asks for trajectories.
+    """The interface of trajectory sources.
 
     Attributes:
         env: Environments like those that are stepped, of any number.
@@ -67,7 +67,7 @@ class TrajectorySource(Protocol):
 
 
 class LocalSource:
-    """Steps environments of this process.
+    """A trajectory source of environments in this process.
 
     Their state is its own, so that a resumed run goes on within their episodes, to the same numbers.
 
@@ -113,14 +113,16 @@ class LocalSource:
     def collect(self) -> TensorDictBase:
         """Return the next trajectories; the time goes to ``physics`` and ``forward``."""
         before = self.env.physics_seconds
-        with self._precision(), _one_thread():
+        # OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step
+        # takes: torch keeps to this thread, and the processors are left to physics.
+        with self._precision(), threads(1):
             batch = next(self._batches)
         self._stopwatch.add("physics", self.env.physics_seconds - before)
         return batch
 
     def metrics(self) -> dict[str, float]:
         """Return the number of simulations that became unstable so far."""
-        return {"episode/faults": self.env.num_diverged}
+        return {"episode/diverged": self.env.num_diverged}
 
     def stop(self) -> None:
         """Shut the collector down, and the environments with it."""
@@ -136,12 +138,12 @@ class LocalSource:
 
 
 def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) -> LocalSource:
-    """Return a collection in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
+    """Return a source in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
     return LocalSource(make_env(num_envs=num_envs, seed=seed))
 
 
 class RemoteSource:
-    """Steps environments in workers, which TorchRL starts by one of its backends, with the newest weights every time.
+    """A trajectory source of workers, started by one of TorchRL's backends, that act by the newest weights.
 
     A resumed run begins new episodes, other ones than those that it began with.
 
@@ -168,7 +170,7 @@ class RemoteSource:
         num_envs: int,
         seed: int,
         num_workers: int,
-        num_threads: int = 1,
+        num_threads: int,
         backend: str = "process",
         backend_options: Mapping[str, Any] | None = None,
     ) -> None:
@@ -236,7 +238,7 @@ class RemoteSource:
 
 
 class _Autocast(TensorDictModuleBase):
-    """A policy in bfloat16 autocast, wherever it is called."""
+    """A policy that computes in bfloat16 autocast."""
 
     def __init__(self, policy: TensorDictModuleBase, device: torch.device) -> None:
         super().__init__()
@@ -254,17 +256,3 @@ def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **setting
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     return make_env(seed=seed, **settings)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to the calling thread, and the processors to physics.
-
-    OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step takes.
-    """
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(num_threads)

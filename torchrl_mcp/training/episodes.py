@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 class EpisodeStatistics:
-    """Sums rewards over episodes that span several batches.
+    """Returns and lengths of episodes that span several batches.
 
     Args:
         num_envs: Number of environments, ``N``.

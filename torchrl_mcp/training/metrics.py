@@ -6,11 +6,11 @@ from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp.training.run_folder import METRICS
+from torchrl_mcp.training.run_folder import METRICS, replacing
 
 
 class MetricsWriter:
-    """Writes one row of metrics per iteration to ``metrics.csv`` and to loggers.
+    """A writer of one row of metrics per iteration, to ``metrics.csv`` and to loggers.
 
     Args:
         folder: The run folder.
@@ -44,10 +44,8 @@ class MetricsWriter:
             kept = [row for row in rows if None not in row.values() and int(row["iteration"]) <= iteration]
         # Without rows the header may be cut short as well: the next row writes it anew.
         self._columns = list(kept[0]) if kept else []
-        partial = self.path.with_name(self.path.name + ".partial")
-        with partial.open("w", newline="") as file:
+        with replacing(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             if kept:
                 writer.writeheader()
             writer.writerows(kept)
-        partial.replace(self.path)

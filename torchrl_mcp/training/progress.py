@@ -1,4 +1,4 @@
-"""How far a run is, and where its time goes."""
+"""The progress of a run, and the time of its sections."""
 
 import time
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from torch import nn
 
 @dataclass
 class Progress:
-    """How far a run is; part of its checkpoints."""
+    """The progress of a run; part of its checkpoints."""
 
     iteration: int = 0
     frames: int = 0

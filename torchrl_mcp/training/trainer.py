@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
-from torchrl.objectives import KLAdaptiveLR, LossModule
+from torchrl.objectives import KLAdaptiveLR
 from tqdm import tqdm
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
@@ -23,11 +24,12 @@ from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.episodes import EpisodeStatistics
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Progress, Stopwatch
+from torchrl_mcp.training.threads import side_by_side
 from torchrl_mcp.training.transfer import FrozenParts
 
 
 class Estimator(Protocol):
-    """What makes samples for the loss from trajectories."""
+    """The interface of advantage estimators: from trajectories to samples for the loss."""
 
     out_keys: Sequence[NestedKey]
 
@@ -44,9 +46,9 @@ class Trainer:
         parts: All parts of the agent by name.
         actor: The actor over those parts.
         critic: The value function over those parts.
-        loss: Their loss; every output whose name begins with ``loss_`` is minimised.
+        losses: What each of ``optimizers`` minimises, by its name: the sum of the outputs that begin with ``loss_``.
         advantages: From trajectories ``(N, T)`` to the samples to learn from, of any batch shape, with the keys
-            ``advantages.out_keys`` that the loss reads beside what the policy stores.
+            ``advantages.out_keys`` that the losses read beside what the policy stores.
         optimizers: Optimisers of all that is trained: of the ``critic``, and of the ``actor`` unless it is frozen.
         frozen: Parts that must not change, checked in every iteration.
         metrics_writer: Where metrics go.
@@ -74,7 +76,7 @@ class Trainer:
         parts: nn.ModuleDict,
         actor: Actor,
         critic: TensorDictModuleBase,
-        loss: LossModule,
+        losses: Mapping[str, nn.Module],
         advantages: Estimator,
         optimizers: Mapping[str, Optimizer],
         frozen: FrozenParts,
@@ -98,8 +100,8 @@ class Trainer:
                 f"frames_per_batch={frames_per_batch} must be a multiple of num_envs={num_envs} and of "
                 f"minibatch_size={minibatch_size}"
             )
-        self.source, self.parts, self.actor, self.critic, self.loss = source, parts, actor, critic, loss
-        self.advantages = advantages
+        self.source, self.parts, self.actor, self.critic = source, parts, actor, critic
+        self.losses, self.advantages = losses, advantages
         self.optimizers = dict(optimizers)
         self.schedule = (
             step_size_schedule(optimizers["actor"]) if step_size_schedule and "actor" in optimizers else None
@@ -149,7 +151,7 @@ class Trainer:
         self.source.stop()
 
     def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``; where the collection's state is all in it, to the same numbers.
+        """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
 
         Raises:
             ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
@@ -173,19 +175,14 @@ class Trainer:
         """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports."""
         keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
         samples = samples.select(*keys, *self.advantages.out_keys).flatten()
-        reports: list[TensorDictBase] = []
-        for _ in range(self.num_epochs):
-            order = torch.randperm(samples.shape[0], device=samples.device)
-            for index in order.split(self.minibatch_size):
-                with self._precision():
-                    report = self.loss(samples[index])
-                sum(value for key, value in report.items() if key.startswith("loss_")).backward()
-                for name, optimizer in self.optimizers.items():
-                    report.set(f"{name}_grad_norm", self._step(optimizer))
-                reports.append(report.detach())
-        metrics = {f"loss/{key}": value for key, value in _mean(reports).items()}
-        last = _mean(reports[-len(reports) // self.num_epochs :])
-        if "mean_ratio" in last:
+        orders = [torch.randperm(samples.shape[0], device=samples.device) for _ in range(self.num_epochs)]
+        minibatches = [index for order in orders for index in order.split(self.minibatch_size)]
+        learning = {name: partial(self._learn, name, samples, minibatches) for name in self.optimizers}
+        # Actor and critic share nothing but samples: on a CPU they learn at the same time.
+        reports = side_by_side(learning) if self.device.type == "cpu" else {name: f() for name, f in learning.items()}
+        metrics = {f"loss/{key}": value for report in reports.values() for key, value in _mean(report).items()}
+        if "actor" in reports:
+            last = _mean(reports["actor"][-len(minibatches) // self.num_epochs :])
             # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
             metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
         self._require_finite(metrics)
@@ -196,6 +193,16 @@ class Trainer:
         with torch.no_grad(), self._precision():
             distribution = self.actor.trained.get_dist(samples[: self.minibatch_size])
         return metrics | _spread(distribution)
+
+    def _learn(self, name: str, samples: TensorDictBase, minibatches: Sequence[Tensor]) -> list[TensorDictBase]:
+        """Take a gradient step of the optimiser of that name on every minibatch; give what its loss reports."""
+        reports: list[TensorDictBase] = []
+        for index in minibatches:
+            with self._precision():
+                report = self.losses[name](samples[index])
+            sum(value for key, value in report.items() if key.startswith("loss_")).backward()
+            reports.append(report.detach().set(f"{name}_grad_norm", self._step(self.optimizers[name])))
+        return reports
 
     def _step(self, optimizer: Optimizer) -> Tensor:
         """Clip the gradient, step, and give the gradient's norm."""

@@ -1,4 +1,4 @@
-"""What a method keeps, freezes and starts anew when it meets a new task (Algorithm 1)."""
+"""Transfer: the parts that a method keeps, freezes and initialises anew on a new task (Algorithm 1)."""
 
 import hashlib
 from collections.abc import Collection, Iterable
@@ -8,7 +8,7 @@ from torch import nn
 
 
 class FrozenParts:
-    """Parts that training must not change, and the proof that it did not.
+    """Parts that training must not change, with a check that it did not.
 
     Args:
         parts: All parts of an agent by name.

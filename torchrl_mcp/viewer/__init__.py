@@ -1,1 +1,1 @@
-"""Policies to look at: in films, in a browser, and in MuJoCo's own window."""
+"""Viewers of policies: films, a browser page, and MuJoCo's own window."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from PIL import Image, ImageDraw, ImageFont
 
-from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK
+from torchrl_mcp.analysis.figures import FAINT, INK, colours
 
 ROW, LENGTH = 1 / 22, 1 / 4
 """Height of a bar's row and length of a bar of weight 1, both relative to the height of the picture."""
@@ -25,8 +25,8 @@ def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> Non
     corner = picture.crop(plate)
     picture.paste(Image.blend(corner, Image.new("RGB", corner.size, "white"), 0.6), plate)
     draw.text((row, row), title, fill=INK, font=font, anchor="lm")
-    for number, weight in enumerate(weights):
-        colour, y = COLOURS[number % len(COLOURS)], top + number * row
+    for number, (weight, colour) in enumerate(zip(weights, colours(len(weights)), strict=True)):
+        y = top + number * row
         draw.text((1.5 * row, y + row / 2), str(number + 1), fill=INK, font=font, anchor="mm")
         for fill, right in ((FAINT, length), (colour, round(length * min(max(weight, 0.0), 1.0)))):
             if right:

@@ -1,9 +1,8 @@
-"""Films of policies at work."""
+"""Films of policies."""
 
 import math
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 
 import mujoco
@@ -12,7 +11,7 @@ from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.envs.rendering import Camera
+from torchrl_mcp.envs.rendering import Camera, save_gif
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.viewer.bars import draw_bars
@@ -21,14 +20,11 @@ from torchrl_mcp.viewer.player import Player
 EVERY = {".gif": 2, ".mp4": 1}
 """Control steps per picture, by the file's suffix."""
 
-COLOURS = 64
-"""Of a picture in a GIF: with as many it is half as large as with 256. An octree keeps the colours of small parts."""
-
 AZIMUTH, ELEVATION = 115.0, -26.0
 """Degrees. Who walks along x is seen from the right and a little from the front, and no horizon is in sight."""
 
 DISTANCE = 2.8
-"""Of the camera, in reaches of the character."""
+"""Of the camera, in extents of the character."""
 
 LAG = 0.25
 """Seconds by which the camera is behind what it follows."""
@@ -53,7 +49,7 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
     timestep, model = player.env.control_timestep, softly_lit(player.env.simulation.model)
-    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.reach
+    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.extent
     camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
     camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
@@ -106,7 +102,7 @@ def save_film(
         height: Pixels.
         deterministic: Play the deterministic action rather than a sample.
         num_options: Number of options among which the policy chooses, 0 if it does not.
-        aside: How far beside the character to draw a ghost, in units of the character's reach.
+        aside: How far beside the character to draw a ghost, in units of the character's extent.
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
@@ -114,28 +110,18 @@ def save_film(
             that is not installed.
     """
     if path.suffix not in EVERY:
-        raise ValueError(f"{path} is no film: call it .gif or .mp4")
+        raise ValueError(f"{path} is not the name of a film: end it with .gif or .mp4")
     save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
     player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
     every = EVERY[path.suffix]
     interval = every * player.env.control_timestep
     if round(seconds / player.env.control_timestep) < every:
-        raise ValueError(f"seconds={seconds} leaves no time for a picture: pass at least {interval:.2f}")
+        raise ValueError(f"seconds={seconds} is too short for a picture: pass at least {interval:.2f}")
     if width < 2 or height < 2:
-        raise ValueError(f"width={width} and height={height} are no size of a picture: pass at least 2 pixels each")
+        raise ValueError(f"width={width} and height={height} are too small for a picture: pass at least 2 pixels each")
     pictures = film(player, seconds=seconds, width=width, height=height, every=every)
     save(pictures, path, interval=interval)
-
-
-def save_gif(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
-    """Write RGB pictures as an animated GIF, one every ``interval`` seconds."""
-    octree, plain = Image.Quantize.FASTOCTREE, Image.Dither.NONE
-    first, *others = (picture.quantize(COLOURS, octree, dither=plain) for picture in pictures)
-    # A GIF counts in hundredths of a second: what is rounded off one picture is added to the next.
-    ticks = [round(100 * interval * number) for number in range(len(others) + 2)]
-    durations = [10 * (end - begin) for begin, end in pairwise(ticks)]
-    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
 
 
 def save_mp4(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:

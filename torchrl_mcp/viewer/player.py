@@ -1,4 +1,4 @@
-"""A policy at work, step by step, to be looked at."""
+"""The player that viewers share: a policy in one simulation, step by step."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.rendering import Shape
-from torchrl_mcp.envs.scenery import reach, scenery
+from torchrl_mcp.envs.scenery import extent, scenery
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 
 
 class Weights(NamedTuple):
-    """How much each of the primitives has to say.
+    """The weight of each primitive.
 
     Args:
         title: What they are.
@@ -26,18 +26,18 @@ class Weights(NamedTuple):
 
 
 class Player:
-    """Plays the first of a batch of simulations; an episode that ends is followed by another.
+    """A policy playing the first of a batch of simulations, episode after episode.
 
     Args:
         policy: From what the environment shows to ``action``, on the CPU.
         env: Environments.
         deterministic: Play the deterministic action rather than a sample.
         num_options: Number of options among which the policy chooses, 0 if it does not.
-        aside: How far beside the character to draw a ghost, in units of the character's reach.
+        aside: How far beside the character to draw a ghost, in units of the character's extent.
 
     Attributes:
         env: The environments without transforms.
-        reach: How far the character extends from its centre of mass, in metres.
+        extent: How far the character extends from its centre of mass, in metres.
         began: Whether an episode has just begun.
     """
 
@@ -51,11 +51,11 @@ class Player:
         aside: float = 1.0,
     ) -> None:
         self.env: CharacterEnv = env.base_env if isinstance(env, TransformedCharacterEnv) else env
-        self.reach = reach(self.env.simulation.model)
+        self.extent = extent(self.env.simulation.model)
         self.began = True
         self._policy, self._transformed, self._num_options = policy, env, num_options
         self._exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-        self._aside = aside * self.reach
+        self._aside = aside * self.extent
         self._state = env.reset()
         self._decision = self._state.empty()
 

@@ -1,4 +1,4 @@
-"""MuJoCo Studio's web viewer, with what it does not know of: ghosts, arrows and the weights of primitives."""
+"""MuJoCo Studio's web viewer with ghosts, arrows and the weights of primitives added."""
 
 import time
 
@@ -7,7 +7,7 @@ from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from mujoco.experimental.studio import launch_web, messages, plugin, sim, ux, viewer_app, viewer_protocol
 from PIL import ImageColor
 
-from torchrl_mcp.analysis.figures import COLOURS
+from torchrl_mcp.analysis.figures import colours
 from torchrl_mcp.envs.rendering import Shape
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
@@ -56,8 +56,8 @@ class Stage(viewer_app.ViewerApp):
             return
         imgui.SetNextWindowPos(imgui.Vec2(16, 48), int(imgui.Cond.FirstUseEver))
         imgui.Begin(weights.title, flags=int(imgui.WindowFlags.AlwaysAutoResize))
-        for number, value in enumerate(weights.values):
-            red, green, blue = ImageColor.getrgb(COLOURS[number % len(COLOURS)])[:3]
+        for number, (value, shown) in enumerate(zip(weights.values, colours(len(weights.values)), strict=True)):
+            red, green, blue = ImageColor.getrgb(shown)[:3]
             colour = imgui.Vec4(red / 255, green / 255, blue / 255, 1.0)
             imgui.PushStyleColor(int(imgui.Col.PlotHistogram), colour)
             imgui.ProgressBar(value, imgui.Vec2(160, 14), "")
@@ -68,7 +68,7 @@ class Stage(viewer_app.ViewerApp):
 
 
 class Pace(plugin.SimPlugin):
-    """What the viewer's controls say of the pace.
+    """The pace that the viewer's controls set.
 
     Attributes:
         paused: Whether to wait.
@@ -98,7 +98,7 @@ def play_in_browser(player: Player, *, port: int) -> None:
         player: What to show.
         port: Of the page, 0 for the first free one from 8080.
     """
-    stage, pace = Stage(distance=FURTHER * DISTANCE * player.reach), Pace()
+    stage, pace = Stage(distance=FURTHER * DISTANCE * player.extent), Pace()
     model = softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)

@@ -31,7 +31,7 @@ def play_in_window(player: Player) -> None:
     with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
         camera = viewer.cam
         camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
-        camera.distance, camera.azimuth, camera.elevation = DISTANCE * player.reach, AZIMUTH, ELEVATION
+        camera.distance, camera.azimuth, camera.elevation = DISTANCE * player.extent, AZIMUTH, ELEVATION
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep
             player.step()

@@ -23,7 +23,7 @@ NAMES = {
     "elbow": ("elbow", "forearm", "lowarm", "lowerarm", "radius"),
     "wrist": ("hand", "wrist"),
 }
-HEADS = ("head", "upperneck", "neck1", "neck")
+HEADS = ("head", "torsohead", "upperneck", "neck1", "neck")
 
 
 def limb(side: str, joints: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -62,7 +62,8 @@ def find_joints(
         Index of a joint for each part.
 
     Raises:
-        MotionFormatError: If the skeleton has not a joint that the map names, or one is not found.
+        MotionFormatError: If the skeleton has not a joint that the map names, one is not found, or a limb or the head
+            is found on the root.
         ValueError: If the map is about what is no part of the body.
     """
     given, known = joint_map or {}, (*TRUNK, *LEGS, *HEAD_AND_ARMS)
@@ -85,9 +86,22 @@ def find_joints(
         raise MotionFormatError(
             source.path,
             f"has no joint known as {', '.join(missing)}: say which it is with a map, such as "
-            f"{missing[0]}={source.names[0]}; its joints are {', '.join(source.names)}",
+            f"{missing[0]}={_suggestion(missing[0], source.names)}; its joints are {', '.join(source.names)}",
+        )
+    trunk = source.ancestors(joints["root"])
+    if wrong := [part for part in parts if part not in TRUNK and joints[part] in trunk]:
+        raise MotionFormatError(
+            source.path,
+            f"has its {wrong[0]} on {source.names[joints[wrong[0]]]}, which carries the whole body: say with a map "
+            f"which joint it is; its joints are {', '.join(source.names)}",
         )
     return {part: joints[part] for part in parts}
+
+
+def _suggestion(part: str, names: Sequence[str]) -> str:
+    """A joint that may be the part, so that nobody follows an example that is wrong; JOINT where names tell nothing."""
+    heads = [name for name in names if part == "neck" and re.search("head|neck", name.lower())]
+    return heads[-1] if heads else "JOINT"
 
 
 def _plain(names: Sequence[str]) -> list[str]:

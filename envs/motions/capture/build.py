@@ -91,11 +91,11 @@ def grounded(character: str, qpos: Tensor) -> Tensor:
         character: Name of the character.
         qpos: States, shape ``(T, nq)``.
     """
-    shift = torch.cat([qpos[0, :2], torch.quantile(lowest_points(character, qpos), 0.02).unsqueeze(0)])
+    shift = torch.cat([qpos[0, :2], torch.quantile(lowest_soles(character, qpos), 0.02).unsqueeze(0)])
     return torch.cat([qpos[:, :3] - shift, qpos[:, 3:]], dim=-1)
 
 
-def lowest_points(character: str, qpos: Tensor) -> Tensor:
+def lowest_soles(character: str, qpos: Tensor) -> Tensor:
     """Height of the lowest point of the feet, shape ``(T,)``, in metres."""
     bodies = body_states(character, qpos, torch.zeros(len(qpos), character_model(character).nv, dtype=torch.float64))
     points = [contact_points(character, foot, bodies).positions for foot in CHARACTERS[character].feet]

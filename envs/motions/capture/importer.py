@@ -1,7 +1,9 @@
 """Recorded motion of any supported format as a clip of a character."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
@@ -11,7 +13,32 @@ from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 
-def import_motion(
+class Import(NamedTuple):
+    """A recorded motion and how it was read.
+
+    Args:
+        clip: The motion.
+        rest_lean: Greatest angle in degrees between the vertical and trunk or legs in the pose that was taken for
+            standing upright: so much of a lean the clip may lack or have too much. NaN for DeepMimic's files, which
+            hold the character's own joints.
+    """
+
+    clip: MotionClip
+    rest_lean: float
+
+
+def import_motion(path: str | Path, character: str, **options: Any) -> MotionClip:
+    """Read a motion file as a clip of the humanoid or the biped: :func:`imported` without how it was read.
+
+    Args:
+        path: The file.
+        character: ``"humanoid"`` or ``"biped"``.
+        **options: Those of :func:`imported`.
+    """
+    return imported(path, character, **options).clip
+
+
+def imported(
     path: str | Path,
     character: str,
     *,
@@ -22,7 +49,7 @@ def import_motion(
     skip: int = 0,
     rest_frame: int | None = None,
     asf: str | Path | None = None,
-) -> MotionClip:
+) -> Import:
     """Read a motion file and carry it over to the humanoid or the biped.
 
     The name says what the file is: ``.bvh``, ``.amc`` (with its ``.asf``), or ``.json`` or ``.txt`` for DeepMimic's.
@@ -46,14 +73,17 @@ def import_motion(
     """
     suffix = Path(path).suffix.lower()
     if suffix in (".json", ".txt"):
-        options = {"scale": scale, "joint_map": joint_map, "skip": skip or None, "rest_frame": rest_frame, "asf": asf}
-        if given := [name for name, value in options.items() if value is not None]:
+        others = {"scale": scale, "joint_map": joint_map, "skip": skip or None, "rest_frame": rest_frame, "asf": asf}
+        if given := [name for name, value in others.items() if value is not None]:
             raise ValueError(f"{given[0]} does not apply to {path}, a file of DeepMimic's: leave it out")
-        return read_deepmimic(path, character, rate=rate, fps=fps)
+        return Import(read_deepmimic(path, character, rate=rate, fps=fps), math.nan)
     if suffix == ".bvh":
         source = read_bvh(path, fps=fps)
     elif suffix == ".amc":
         source = read_asf_amc(path, asf=asf, fps=fps)
     else:
         raise MotionFormatError(path, "ends in none of .bvh, .amc, .json and .txt: pass a motion, or rename it")
-    return retarget(source, character, rate=rate, scale=scale, joint_map=joint_map, skip=skip, rest_frame=rest_frame)
+    clip, rest_lean = retarget(
+        source, character, rate=rate, scale=scale, joint_map=joint_map, skip=skip, rest_frame=rest_frame
+    )
+    return Import(clip, rest_lean)

@@ -20,6 +20,9 @@ UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
 LEG_LENGTHS = (0.7, 1.0)
 """Metres from hip to ankle, of adults."""
 
+SHORTEST_TRUNK = 0.1
+"""Metres from hips to chest below which the line between them does not say how the trunk leans."""
+
 
 class Recording(NamedTuple):
     """Parts of a body, by name, in metres and the character's axes: x forward, y left, z up while it stands.
@@ -39,6 +42,20 @@ class Recording(NamedTuple):
     def direction(self, start: str, end: str) -> Tensor:
         """Unit vectors from one part's beginning to another's, shape ``(T, 3)``."""
         return normalize(self.positions[end] - self.positions[start], dim=-1)
+
+    def lean(self) -> float:
+        """Greatest angle in degrees from the vertical in the pose that is taken for standing: how far it is from it.
+
+        Counted are the trunk and, forwards and backwards, the legs' bones: many rest poses spread the legs.
+        """
+        middle = (self.standing["right_hip"] + self.standing["left_hip"]) / 2
+        trunk = self.standing["chest"] - middle
+        lines = [
+            (self.standing[start] - self.standing[end]) * torch.tensor([1.0, 0.0, 1.0]) for start, end in bones(LEG)
+        ]
+        lines += [trunk] if trunk.norm() > SHORTEST_TRUNK else []
+        upright = torch.stack([normalize(line, dim=-1)[2] for line in lines])
+        return math.degrees(float(upright.clamp(-1, 1).acos().max()))
 
     def leg_length(self) -> float:
         """Mean length of thigh and shank together."""
@@ -60,7 +77,8 @@ def record(
     source = source.without_first(skip)
     _require_end(source)
     pose = source.poses()
-    axes = _standing_axes(source, {part: rest.positions[joint] for part, joint in joints.items()})
+    named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"
+    axes = _standing_axes(source, {part: rest.positions[joint] for part, joint in joints.items()}, named)
     metres = _metres_per_unit(source, {part: pose.positions[:, joint] for part, joint in joints.items()}, scale)
     positions, standing = metres * pose.positions @ axes.mT, metres * rest.positions @ axes.mT
     turns = multiply(pose.rotations, inverse(rest.rotations).expand_as(pose.rotations))
@@ -82,7 +100,7 @@ def _require_end(source: SourceMotion) -> None:
         raise MotionFormatError(source.path, f"lasts {seconds:.0f} s, more than an hour: correct the rate, or split it")
 
 
-def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor]) -> Tensor:
+def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor], named: str) -> Tensor:
     """Forward, left and up in the axes of the source, the rows of a rotation matrix, shape ``(3, 3)``."""
     upwards = rest["right_hip"] + rest["left_hip"] - rest["right_ankle"] - rest["left_ankle"]
     main = int(upwards.abs().argmax())
@@ -94,8 +112,8 @@ def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor]) -> Tensor:
     if max(legs) > -0.5 or max(arms, default=0.0) > 0.9 or not left.any():
         raise MotionFormatError(
             source.path,
-            "its rest pose does not stand with the legs straight and the arms down or to the sides: say in which frame "
-            "it does (rest frame), or with a map which joints are which",
+            f"{named} does not stand with the legs straight and the arms down or to the sides: take a frame that does "
+            "instead, such as the first with --rest-frame 0, or say with a map which joints are which",
         )
     return torch.stack([torch.linalg.cross(left, up), left, up])
 

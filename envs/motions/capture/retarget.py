@@ -37,8 +37,8 @@ def retarget(
     joint_map: Mapping[str, str] | None = None,
     skip: int = 0,
     rest_frame: int | None = None,
-) -> MotionClip:
-    """Carry a recorded motion over to the humanoid or the biped.
+) -> tuple[MotionClip, float]:
+    """Carry a recorded motion over to the humanoid or the biped, and say how far from standing its rest pose is.
 
     Parts of the character turn as those of the recorded body do, relative to a standing pose: legs and arms straight
     down. A bone that the source's rest pose holds otherwise, such as the arms of a T, is first brought there the
@@ -55,6 +55,9 @@ def retarget(
         skip: Frames to leave out at the beginning.
         rest_frame: Frame, from 0 and before any are left out, in which the source stands upright, for one whose rest
             pose does not.
+
+    Returns:
+        The clip, and :meth:`Recording.lean` of the pose that was taken for standing.
 
     Raises:
         MotionFormatError: If the motion cannot be that of a human body: in build, in size, or in speed.
@@ -80,7 +83,7 @@ def retarget(
     hips = (body.positions["right_hip"] + body.positions["left_hip"]) / 2
     hips[:, 2] -= hips[:, :2] @ _slope(body)
     path = hips * (leg_length(character) / body.leg_length())
-    return assembled(character, path, motion, body.times, rate=rate)
+    return assembled(character, path, motion, body.times, rate=rate), body.lean()
 
 
 def leg_length(character: str) -> float:

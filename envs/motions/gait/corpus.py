@@ -6,8 +6,8 @@ from torch import Tensor
 
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import FPS, stride, walk
-from torchrl_mcp.envs.motions.inspection.signals import smoothed
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
+from torchrl_mcp.envs.motions.smoothing import smoothed
 
 WALKS, DURATION = 7, 16.4
 """Number and seconds: with their mirror images 229.6 s, as much as the paper's corpus."""

@@ -7,6 +7,7 @@ is flat on the ground, to the next: from 0.25 to 1.25. The keys follow published
 from collections.abc import Sequence
 
 import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 MID_STANCE = 0.25
@@ -47,46 +48,23 @@ CLEARANCE = (
 )
 """Height of the foot's lowest point in metres. The heel arrives with a little speed, as heels do."""
 
+ASIDE = ((0.57, 0.0), (0.80, 0.04), (1.03, 0.0))
+"""Metres by which a foot swings outwards around the other leg in a curve, where that one points across its way."""
+
 ROUNDING = ((0.80, 0.0), (0.90, 0.2), (1.02, 0.0))
 """Angle in radians within which the lowest point of a swinging foot passes smoothly from toe to heel."""
 
 
-class Spline:
-    r"""Cubic spline with continuous curvature and no slope at its ends, held beyond them.
-
-    Between keys :math:`h` apart, at :math:`u \in [0, 1]`, it is the Hermite polynomial
-
-    .. math:: (1 + 2u)(1 - u)^2 y_i + u (1 - u)^2 h m_i + u^2 (3 - 2u) y_{i+1} - u^2 (1 - u) h m_{i+1}
-
-    whose slopes :math:`m` make the curvatures agree.
+def spline(keys: Sequence[tuple[float, float]] | Tensor, place: Tensor) -> Tensor:
+    """Cubic spline with continuous curvature and no slope at its ends, held beyond them.
 
     Args:
         keys: Pairs of place and value, two or more, by increasing place.
+        place: Where to read it, any shape, which is that of the result.
     """
-
-    def __init__(self, keys: Sequence[tuple[float, float]] | Tensor) -> None:
-        self.places, self.values = torch.as_tensor(keys, dtype=torch.float64).T.contiguous()
-        self.gaps = gaps = self.places.diff()
-        rises = self.values.diff() / gaps
-        diagonal = torch.ones_like(self.places)
-        diagonal[1:-1] = 2 / gaps[:-1] + 2 / gaps[1:]
-        off = 1 / gaps
-        system = torch.diag(diagonal)
-        system[1:-1, :-2] += torch.diag(off[:-1])
-        system[1:-1, 2:] += torch.diag(off[1:])
-        bends = torch.zeros_like(self.places)
-        bends[1:-1] = 3 * (rises[:-1] / gaps[:-1] + rises[1:] / gaps[1:])
-        self.slopes = torch.linalg.solve(system, bends)
-
-    def __call__(self, place: Tensor) -> Tensor:
-        """Value at any places, of the same shape."""
-        place = place.clamp(self.places[0], self.places[-1])
-        i = torch.searchsorted(self.places, place.contiguous(), right=True).clamp(1, len(self.gaps)) - 1
-        h, u = self.gaps[i], (place - self.places[i]) / self.gaps[i]
-        v = 1 - u
-        before = (1 + 2 * u) * self.values[i] + u * h * self.slopes[i]
-        after = (1 + 2 * v) * self.values[i + 1] - v * h * self.slopes[i + 1]
-        return v * v * before + u * u * after
+    places, values = torch.as_tensor(keys, dtype=torch.float64).T.numpy()
+    curve = CubicSpline(places, values, bc_type="clamped")
+    return torch.from_numpy(curve(place.clamp(places[0], places[-1]).numpy()))
 
 
 def wave(phase: Tensor, peak: float, harmonic: int = 1) -> Tensor:

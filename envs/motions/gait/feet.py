@@ -8,19 +8,29 @@ from torch import Tensor
 from torchrl_mcp.envs.motions.gait.course import FOOTHOLD, Course, Side, between_frames, direction
 from torchrl_mcp.envs.motions.gait.curves import (
     ADVANCE,
+    ASIDE,
     CLEARANCE,
     FOOT_PITCH,
     MID_STANCE,
     ROUNDING,
     TOE_OFF,
-    Spline,
     settled,
+    spline,
 )
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.rotations import about_y, about_z, multiply
 
-STEP_WIDTH, LEAST_WIDTH = 0.12, 0.07
-"""Between the ankles in metres, straight ahead and in the sharpest turns."""
+STEP_WIDTH, CURVE_WIDTH, SPOT_WIDTH = 0.12, 0.10, 0.20
+"""Between the ankles in metres: straight ahead, in a curve, and turning on the spot, where the legs would cross."""
+
+CURVED = 0.9
+"""Turn rate in rad/s, much above which feet stand and swing as in a curve."""
+
+TIGHT = 4.0
+"""Curvature in 1/m, much above which feet stand as in a turn on the spot."""
+
+CREEPING = 0.1
+"""Speed in m/s, added to the own for the curvature: who stands still walks no curve."""
 
 TOE_OUT = 0.09
 """In radians."""
@@ -86,17 +96,18 @@ def step(course: Course, side: Side, sole: Sole) -> Foot:
     distance, turn = torch.linalg.vector_norm(end - start, dim=-1), end_heading - start_heading
     vigour, stepping = settled(distance, LONG), settled(torch.hypot(distance, STEP_WIDTH * turn), SHORT)
 
-    position, heading = _foothold(course, side, last + Spline(ADVANCE)(phase) * (following - last))
-    pitch = _rolling(course, side, phase) * torch.deg2rad(Spline(FOOT_PITCH)(phase))
-    ahead, height = rolled(pitch, sole, vigour * Spline(ROUNDING)(phase))
-    height = height + Spline(CLEARANCE)(phase) * (0.4 * stepping + 0.6 * vigour)
-    ankle = torch.cat([position + ahead.unsqueeze(-1) * direction(heading), height.unsqueeze(-1)], dim=-1)
-    inward = -side.sign * MEDIAL * direction(heading + torch.pi / 2)
+    position, heading = _foothold(course, side, last + spline(ADVANCE, phase) * (following - last))
+    pitch = _rolling(course, side, phase) * torch.deg2rad(spline(FOOT_PITCH, phase))
+    ahead, height = rolled(pitch, sole, vigour * spline(ROUNDING, phase))
+    height = height + spline(CLEARANCE, phase) * (0.4 * stepping + 0.6 * vigour)
+    outward = side.sign * direction(heading + torch.pi / 2)
+    aside = spline(ASIDE, phase) * stepping * settled(course.turn_rate, CURVED)
+    ground = position + ahead.unsqueeze(-1) * direction(heading) + aside.unsqueeze(-1) * outward
     return Foot(
         heading=heading,
-        ankle=ankle,
+        ankle=torch.cat([ground, height.unsqueeze(-1)], dim=-1),
         orientation=multiply(about_z(heading), about_y(-pitch)),
-        support=position + ARCH * direction(heading) + inward,
+        support=position + ARCH * direction(heading) - MEDIAL * outward,
         unloaded=stepping * _swinging(phase),
     )
 
@@ -131,8 +142,9 @@ def _rolling(course: Course, side: Side, phase: Tensor) -> Tensor:
 def _foothold(course: Course, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
     """Position on the ground and heading of a flat foot beside the body as it is in some frames."""
     heading = between_frames(course.heading, frames)
-    turn_rate = between_frames(course.turn_rate, frames)
-    width = LEAST_WIDTH + (STEP_WIDTH - LEAST_WIDTH) / (1 + turn_rate**2 / 2)
+    turn_rate, speed = between_frames(course.turn_rate, frames), between_frames(course.speed, frames)
+    width = STEP_WIDTH + (CURVE_WIDTH - STEP_WIDTH) * settled(turn_rate, CURVED)
+    width = width + (SPOT_WIDTH - width) * settled((turn_rate / (speed + CREEPING)) ** 2, TIGHT**2)
     beside = (side.sign * width / 2).unsqueeze(-1) * direction(heading + torch.pi / 2)
     return between_frames(course.balance, frames) + beside, heading + side.sign * TOE_OUT
 

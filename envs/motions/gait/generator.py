@@ -12,7 +12,7 @@ from torchrl_mcp.envs.motions.gait.body import build_of, head_and_arms, pelvis_o
 from torchrl_mcp.envs.motions.gait.course import GRAVITY, SIDES, Course, Side, plan, stride_rate
 from torchrl_mcp.envs.motions.gait.curves import settled
 from torchrl_mcp.envs.motions.gait.feet import Foot, step
-from torchrl_mcp.envs.motions.gait.legs import pelvis_height, reach
+from torchrl_mcp.envs.motions.gait.legs import leg_joints, pelvis_height
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import inverse, multiply
 
@@ -102,7 +102,7 @@ def _states(character: str, speed: Tensor, turn_rate: Tensor, fps: float, start:
     root = torch.cat([position, height.unsqueeze(-1)], dim=-1)
     joints = {"root": torch.cat([root, pelvis], dim=-1), build.trunk: multiply(inverse(pelvis), trunk)}
     for side in SIDES:
-        hip, knee, ankle = reach(build.leg, side, pelvis, root, feet[side], course.heading)
+        hip, knee, ankle = leg_joints(build.leg, side, pelvis, root, feet[side], course.heading)
         joints |= {f"{side.name}_hip": hip, f"{side.name}_knee": -knee.unsqueeze(-1), f"{side.name}_ankle": ankle}
     if character == "humanoid":
         joints |= head_and_arms(course, activity, trunk)
@@ -118,10 +118,10 @@ def _balanced(course: Course, feet: Mapping[Side, Foot], height: float) -> Tenso
     right, left = (feet[side] for side in SIDES)
     share = ((1 - right.unloaded) / (2 - right.unloaded - left.unloaded)).unsqueeze(-1)
     support = share * right.support + (1 - share) * left.support
-    reach = round(MARGIN * course.fps)
-    time = torch.arange(-reach, reach + 1, dtype=torch.float64).abs() / course.fps
+    half = round(MARGIN * course.fps)
+    time = torch.arange(-half, half + 1, dtype=torch.float64).abs() / course.fps
     kernel = torch.exp(-math.sqrt(GRAVITY / height) * time)
-    padded = pad(support.T.unsqueeze(1), (reach, reach), mode="replicate")
+    padded = pad(support.T.unsqueeze(1), (half, half), mode="replicate")
     return conv1d(padded, (kernel / kernel.sum()).view(1, 1, -1)).squeeze(1).T
 
 

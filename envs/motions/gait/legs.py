@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv1d, max_pool1d, pad
+from torch.nn.functional import conv1d, max_pool1d, pad, softplus
 
 from torchrl_mcp.envs.motions.gait.course import SIDES, Course, Side, between_frames
-from torchrl_mcp.envs.motions.gait.curves import Spline
+from torchrl_mcp.envs.motions.gait.curves import spline
 from torchrl_mcp.envs.motions.gait.feet import Foot
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, inverse, multiply, rotate
 
@@ -32,6 +32,9 @@ RELIEF = 0.16
 OUTWARD = 0.7
 """Part of the angle between pelvis and foot that the hip turns, the rest being the ankle's."""
 
+INWARD = 0.1
+"""Angle in radians by which a foot may turn in and the hip with it; the ankle turns the rest, or knees would cross."""
+
 
 class Leg(NamedTuple):
     """A leg's bones.
@@ -50,7 +53,7 @@ class Leg(NamedTuple):
         """From the root to a hip in the world, shape ``(F, 3)``, for orientations of the pelvis ``(F, 4)``."""
         return rotate(pelvis, self.hip * torch.tensor([1.0, side.sign, 1.0]))
 
-    def reach(self, flexion: Tensor) -> Tensor:
+    def length(self, flexion: Tensor) -> Tensor:
         """Distance from hip to ankle by the law of cosines, for flexions of the knee in radians."""
         return (self.thigh**2 + self.shank**2 + 2 * self.thigh * self.shank * flexion.cos()).sqrt()
 
@@ -79,11 +82,11 @@ def pelvis_height(
             frames = _moments(course, side.offset + phase)
             keys.append(torch.stack([frames, between_frames(_lower(asked, allowed), frames)], dim=-1))
     heights = torch.cat(keys)
-    height = Spline(heights[heights[:, 0].argsort()])(torch.arange(len(position), dtype=position.dtype))
+    height = spline(heights[heights[:, 0].argsort()], torch.arange(len(position), dtype=position.dtype))
     return height - _relief(leg, pelvis, torch.cat([position, height.unsqueeze(-1)], dim=-1), feet, course.fps)
 
 
-def reach(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, forward: Tensor) -> tuple[Tensor, ...]:
+def leg_joints(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, forward: Tensor) -> tuple[Tensor, ...]:
     """Solve a leg between hip and ankle; its plane stands upright over the direction between pelvis and foot.
 
     Args:
@@ -100,10 +103,11 @@ def reach(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, forwar
     """
     line = root + leg.hip_offset(side, pelvis) - foot.ankle
     length = torch.linalg.vector_norm(line, dim=-1)
-    heading = forward + OUTWARD * (foot.heading - forward)
+    outward = softplus(side.sign * (foot.heading - forward) + INWARD, beta=1 / INWARD) - INWARD
+    heading = forward + OUTWARD * side.sign * outward
     x, y, z = (rotate(about_z(-heading), line) / length.unsqueeze(-1)).unbind(-1)
     limb = multiply(about_z(heading), multiply(about_y(torch.atan2(x, z)), about_x(-y.asin())))
-    length = length.clamp_max(float(leg.reach(torch.deg2rad(torch.tensor(1.0)))))
+    length = length.clamp_max(float(leg.length(torch.deg2rad(torch.tensor(1.0)))))
     hip = torch.acos((leg.thigh**2 + length**2 - leg.shank**2) / (2 * leg.thigh * length))
     ankle = torch.acos((leg.shank**2 + length**2 - leg.thigh**2) / (2 * leg.shank * length))
     thigh, shank = multiply(limb, about_y(-hip)), multiply(limb, about_y(ankle))
@@ -116,14 +120,14 @@ def _height_over(
     """Height of the root with which the leg's knee has a flexion (in degrees, when walking), shape ``(F,)``."""
     hip = leg.hip_offset(side, pelvis)
     away = position + hip[:, :2] - foot.ankle[:, :2]
-    reach = leg.reach(torch.deg2rad(STANDING_KNEE + activity * (flexion - STANDING_KNEE)))
-    rise = (reach.square() - away.square().sum(-1)).clamp_min(0.01).sqrt()
+    length = leg.length(torch.deg2rad(STANDING_KNEE + activity * (flexion - STANDING_KNEE)))
+    rise = (length.square() - away.square().sum(-1)).clamp_min(0.01).sqrt()
     return foot.ankle[:, 2] + rise - hip[:, 2]
 
 
 def _relief(leg: Leg, pelvis: Tensor, root: Tensor, feet: Mapping[Side, Foot], fps: float) -> Tensor:
     """How far the pelvis has to come down for no leg to be stretched, smooth in time, shape ``(F,)``."""
-    limit = leg.reach(torch.deg2rad(root.new_tensor(LEAST_KNEE)))
+    limit = leg.length(torch.deg2rad(root.new_tensor(LEAST_KNEE)))
     excess = torch.zeros_like(root[:, 2])
     for side, foot in feet.items():
         line = root + leg.hip_offset(side, pelvis) - foot.ankle

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
+from torchrl_mcp.envs.motions.inspection.crossing import legs_apart
 from torchrl_mcp.envs.motions.joints import character_model, joint_layout
 from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import to_rotation_vector
@@ -34,6 +35,7 @@ class Feasibility(NamedTuple):
         airborne: Fraction of the frames without a foot on the ground.
         imbalance: Distance in metres from the feet on the ground to the centre of pressure that the motion asks for,
             exceeded in 5 % of the frames: what the ground would have to pull.
+        crossing: Greatest depth in metres to which one leg is in the other.
     """
 
     limit: float
@@ -44,6 +46,7 @@ class Feasibility(NamedTuple):
     torque_joint: str
     airborne: float
     imbalance: float
+    crossing: float
 
 
 def feasibility(clip: MotionClip) -> Feasibility:
@@ -79,6 +82,7 @@ def feasibility(clip: MotionClip) -> Feasibility:
         torque_joint=torque_joint,
         airborne=1 - len(slide) / len(slowest),
         imbalance=imbalance,
+        crossing=max(0.0, -float(legs_apart(clip.character, clip.qpos).min())),
     )
 
 

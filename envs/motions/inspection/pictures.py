@@ -13,11 +13,11 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.pd_character import add_ground
-from torchrl_mcp.envs.rendering import Camera
+from torchrl_mcp.envs.rendering import Camera, save_gif
 from torchrl_mcp.envs.rotations import heading
 
 FILM_FPS = 25.0
-"""A GIF counts in hundredths of a second: 25 frames per second play at the right speed, 30 do not."""
+"""Pictures per second of a film."""
 
 
 def pictures(clip: MotionClip, times: Tensor, *, size: int, follow_heading: bool) -> Iterator[Tensor]:
@@ -94,7 +94,5 @@ def save_film(clip: MotionClip, path: str | Path, *, seconds: float = math.inf, 
         size: Width and height in pixels.
     """
     times = torch.arange(0, min(clip.duration, seconds), 1 / FILM_FPS, dtype=torch.float64)
-    first, *others = (
-        Image.fromarray(picture.numpy()) for picture in pictures(clip, times, size=size, follow_heading=False)
-    )
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / FILM_FPS), loop=0)
+    drawn = pictures(clip, times, size=size, follow_heading=False)
+    save_gif((Image.fromarray(picture.numpy()) for picture in drawn), Path(path), interval=1 / FILM_FPS)

@@ -4,16 +4,16 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv1d, pad
 
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names
+from torchrl_mcp.envs.motions.smoothing import smoothed
 from torchrl_mcp.envs.rotations import heading, rotate
 
 
-class Root(NamedTuple):
+class RootSignals(NamedTuple):
     """Of pelvis and trunk, each ``(T,)`` unless stated, in metres, seconds and degrees but for the heading.
 
     Args:
@@ -41,7 +41,7 @@ class Root(NamedTuple):
     trunk_roll: Tensor
 
 
-class Leg(NamedTuple):
+class LegSignals(NamedTuple):
     """Of a leg and the arm on its side, each ``(T,)``, in metres, m/s and degrees.
 
     Args:
@@ -71,7 +71,7 @@ class Leg(NamedTuple):
     elbow: Tensor
 
 
-def root_signals(clip: MotionClip, states: BodyStates, window: float) -> Root:
+def root_signals(clip: MotionClip, states: BodyStates, window: float) -> RootSignals:
     """Follow pelvis and trunk.
 
     Args:
@@ -86,7 +86,7 @@ def root_signals(clip: MotionClip, states: BodyStates, window: float) -> Root:
     position = states.positions[:, 0, :2]
     path = smoothed(position.T, clip.fps, window).T
     forward, left = _axes(facing)
-    return Root(
+    return RootSignals(
         position=position,
         path=path,
         heading=facing,
@@ -100,7 +100,7 @@ def root_signals(clip: MotionClip, states: BodyStates, window: float) -> Root:
     )
 
 
-def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: Root) -> Leg:
+def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: RootSignals) -> LegSignals:
     """Follow the leg and the arm of a side, ``"right"`` or ``"left"``."""
     names, model = body_names(clip.character), character_model(clip.character)
     forward, left = _axes(root.heading)
@@ -117,7 +117,7 @@ def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: Root) -> 
     if f"{side}_elbow" in names:
         arm = _inclination(-_axis(states.orientations[:, names.index(f"{side}_shoulder")], 2), forward)
         elbow = torch.rad2deg(clip.qpos[:, model.joint(f"{side}_elbow").qposadr[0]])
-    return Leg(
+    return LegSignals(
         ahead=((ankle - root.position) * forward).sum(-1),
         toe_ahead=((toes[:, :2] - root.position) * forward).sum(-1),
         across=((ankle - root.path) * left).sum(-1),
@@ -130,14 +130,6 @@ def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: Root) -> 
         arm=arm,
         elbow=elbow,
     )
-
-
-def smoothed(values: Tensor, fps: float, window: float) -> Tensor:
-    """Average over time, the last dimension, by a Hann window of a length in seconds; the ends are held."""
-    half = max(1, min(round(window * fps / 2), values.shape[-1] - 1))
-    weights = torch.hann_window(2 * half + 1, periodic=False, dtype=values.dtype)
-    held = pad(values.reshape(-1, 1, values.shape[-1]), (half, half), mode="replicate")
-    return conv1d(held, (weights / weights.sum()).view(1, 1, -1)).view_as(values)
 
 
 def unwrapped(angles: Tensor) -> Tensor:

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.inspection.signals import Leg, Root, leg_signals, root_signals, smoothed, unwrapped
+from torchrl_mcp.envs.motions.inspection.signals import LegSignals, RootSignals, leg_signals, root_signals, unwrapped
 from torchrl_mcp.envs.motions.inspection.strides import Stride, find_strides
 from torchrl_mcp.envs.motions.kinematics import body_states
+from torchrl_mcp.envs.motions.smoothing import smoothed
 from torchrl_mcp.envs.rotations import heading
 
 LEAST_FPS = 60.0
@@ -84,6 +85,16 @@ class GaitStatistics(NamedTuple):
     toe_clearance: Tensor
     slide: Tensor
 
+    @property
+    def stride_length(self) -> Tensor:
+        """Way along the heading in a stride, in metres."""
+        return self.speed * self.stride_time
+
+    @property
+    def cadence(self) -> Tensor:
+        """Steps per minute: two for each stride."""
+        return 120 / self.stride_time
+
     def select(self, strides: Tensor) -> "GaitStatistics":
         """Keep the strides of a mask, shape ``(S,)``."""
         return GaitStatistics(*(field[strides] for field in self))
@@ -133,7 +144,7 @@ def _prepared(clip: MotionClip) -> MotionClip:
     return clip if clip.fps >= LEAST_FPS else clip.resampled(2 * LEAST_FPS)
 
 
-def _measured(stride: Stride, root: Root, legs: dict[str, Leg], fps: float) -> list[float]:
+def _measured(stride: Stride, root: RootSignals, legs: dict[str, LegSignals], fps: float) -> list[float]:
     """All of :class:`GaitStatistics` for one stride, in order."""
     leg, other = legs[stride.side], legs[stride.other]
     frames = stride.end - stride.start

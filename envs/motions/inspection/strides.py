@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.inspection.signals import Leg
+from torchrl_mcp.envs.motions.inspection.signals import LegSignals
 
 STRIKE_DELAY = 0.019
 """Seconds by which a heel strikes after the ankle was furthest ahead of the root, as other measurements show."""
@@ -48,7 +48,7 @@ class Stride(NamedTuple):
         return slice(self.start + int(start * frames), self.start + int(end * frames))
 
 
-def find_strides(legs: Mapping[str, Leg], fps: float) -> list[Stride]:
+def find_strides(legs: Mapping[str, LegSignals], fps: float) -> list[Stride]:
     """Find all whole strides.
 
     A heel strikes 19 ms after its ankle was furthest ahead of the root; a foot leaves the ground when its toes are

@@ -32,7 +32,7 @@ class Summary(NamedTuple):
     slide: float
 
 
-def summary(clip: MotionClip) -> Summary:
+def summarised(clip: MotionClip) -> Summary:
     """Sum up a clip of a character with two feet."""
     steps = clip.qpos[:, :2].diff(dim=0).norm(dim=-1)
     turns = heading(clip.qpos[:, 3:7]).diff()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.motions import textfile
+from torchrl_mcp.envs.motions.capture import textfile
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 

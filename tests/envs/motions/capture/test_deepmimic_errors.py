@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_mcp.envs.motions import textfile
+from torchrl_mcp.envs.motions.capture import textfile
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 

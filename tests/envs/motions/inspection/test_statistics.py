@@ -5,7 +5,7 @@ import torch
 
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.inspection.signals import smoothed, unwrapped
+from torchrl_mcp.envs.motions.inspection.signals import unwrapped
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics, speed_and_turn_rate
 from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, multiply
@@ -94,13 +94,6 @@ def test_strides_are_kept_by_a_mask():
 def test_a_clip_without_strides_gives_none():
     still = puppet(seconds=1.0).section(0.0, 0.3)
     assert all(len(field) == 0 for field in gait_statistics(still))
-
-
-def test_a_hann_window_of_two_periods_removes_a_wave_and_keeps_a_constant():
-    wave = 3 + torch.sin(2 * math.pi * torch.arange(600, dtype=torch.float64) / 50)
-    torch.testing.assert_close(
-        smoothed(wave, 10.0, 10.0)[100:-100], torch.full((400,), 3.0).double(), atol=1e-9, rtol=0
-    )
 
 
 def test_unwrapped_angles_go_on_beyond_a_full_turn():

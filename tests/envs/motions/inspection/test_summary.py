@@ -5,7 +5,7 @@ import torch
 
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
-from torchrl_mcp.envs.motions.inspection.summary import summary
+from torchrl_mcp.envs.motions.inspection.summary import summarised
 from torchrl_mcp.envs.motions.joints import character_model
 
 
@@ -34,20 +34,20 @@ def on_a_circle(radius, rate, frames=101):
 
 @pytest.mark.parametrize("rate", [0.7, -1.5])
 def test_speed_and_turn_rate_are_those_of_the_root(rate):
-    found = summary(on_a_circle(2.0, rate))
+    found = summarised(on_a_circle(2.0, rate))
     assert found.duration == pytest.approx(10.0)
     assert found.speed == pytest.approx(2.0 * abs(rate), rel=1e-2)
     assert found.turn_rate == pytest.approx(abs(rate))
 
 
 def test_who_does_not_walk_does_not_slide():
-    assert math.isnan(summary(standing(5)).slide)
-    assert math.isnan(summary(on_a_circle(1.0, 3.0)).slide)  # too fast for that
+    assert math.isnan(summarised(standing(5)).slide)
+    assert math.isnan(summarised(on_a_circle(1.0, 3.0)).slide)  # too fast for that
 
 
 def test_the_feet_of_a_generated_walk_stand_and_those_of_one_on_ice_slide():
     walk = stride("humanoid", 1.0, 0.0, strides=3)
-    assert summary(walk).slide < 0.05
+    assert summarised(walk).slide < 0.05
     skating = MotionClip("humanoid", walk.qpos.clone(), walk.fps)
     skating.qpos[:, 1] += 0.4 * torch.arange(len(walk.qpos)) / walk.fps
-    assert summary(skating).slide == pytest.approx(0.4, abs=0.05)
+    assert summarised(skating).slide == pytest.approx(0.4, abs=0.05)

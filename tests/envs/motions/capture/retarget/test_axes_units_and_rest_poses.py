@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.joints import character_model
 
@@ -71,7 +72,7 @@ def test_legs_that_the_rest_pose_spreads_hang_straight_when_the_motion_closes_th
 
 
 def test_a_rest_pose_that_does_not_stand_is_refused(load, own_frames):
-    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand .*rest frame"):
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand .* --rest-frame 0, or"):
         load([{}] * 2, frames=own_frames)
 
 
@@ -86,3 +87,30 @@ def test_the_frame_that_stands_may_be_left_out(load, any_pose, own_frames):
     expected = load([{}, any_pose, any_pose], fps=2.0, options={"skip": 1})
     found = load([{}, any_pose, any_pose], fps=2.0, frames=own_frames, options={"skip": 1, "rest_frame": 0})
     torch.testing.assert_close(found.qpos, expected.qpos, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 35.0])
+def test_how_far_a_rest_frame_is_from_standing_is_the_lean_of_its_trunk_or_the_stride_of_its_legs(
+    bvh, tmp_path, about, degrees
+):
+    path = tmp_path / "motion.bvh"
+    for turn in ({"Hips": about([1, 0, 0], degrees)}, {"LeftUpLeg": about([-1, 0, 0], degrees)}):
+        path.write_text(bvh([turn, {}]))
+        # From the middle of the hips, 2 cm below the root and 1 cm ahead, to the chest 24 cm above it.
+        built = np.degrees(np.arctan2(0.01, 0.26))
+        expected = max(abs(degrees - built), degrees) if "Hips" in turn else max(degrees, built)
+        assert imported(path, "humanoid", rest_frame=0, rate=30.0).rest_lean == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_rest_pose_that_spreads_the_legs_stands(bvh, tmp_path, splayed):
+    path = tmp_path / "motion.bvh"
+    path.write_text(bvh([{}] * 2, body=splayed))
+    assert imported(path, "biped").rest_lean == pytest.approx(np.degrees(np.arctan2(0.01, 0.26)), abs=1e-3)
+
+
+def test_a_frame_that_does_not_stand_is_refused_by_its_number(load, about):
+    sitting = {f"{side}UpLeg": about([-1, 0, 0], 80) for side in ("Left", "Right")}
+    sitting |= {f"{side}Leg": about([1, 0, 0], 80) for side in ("Left", "Right")}
+    assert load([{}, sitting], fps=2.0, options={"rest_frame": 0}).character == "humanoid"
+    with pytest.raises(MotionFormatError, match=r"frame 1 does not stand .* --rest-frame 0"):
+        load([{}, sitting], fps=2.0, options={"rest_frame": 1})

@@ -84,3 +84,26 @@ def test_a_body_without_arms_will_do_for_the_biped(load, skeleton):
     assert load([{}] * 2, "biped", body=legs, options={"joint_map": {"chest": "Chest"}}).character == "biped"
     with pytest.raises(MotionFormatError, match="no joint known as chest, neck, right_shoulder, right_elbow"):
         load([{}] * 2, "humanoid", body=legs)
+
+
+def test_the_example_of_the_error_is_a_joint_of_that_name_or_none(load):
+    with pytest.raises(MotionFormatError, match=r"no joint known as neck: .* such as neck=UpperHeadJoint; its joints"):
+        load([{}] * 2, rename=lambda name: {"Head": "UpperHeadJoint", "Neck": "LowerNeckJoint"}.get(name, name))
+    with pytest.raises(MotionFormatError, match=r"such as neck=JOINT; its joints"):
+        load([{}] * 2, rename=lambda name: {"Head": "Tete", "Neck": "Cou"}.get(name, name))
+    with pytest.raises(MotionFormatError, match=r"such as left_knee=JOINT; its joints"):
+        load([{}] * 2, rename=lambda name: {"LeftLeg": "Gauche2"}.get(name, name))
+
+
+@pytest.mark.parametrize("head", ["torso_head", "Head", "UpperNeck"])
+def test_the_head_is_known_by_several_names(load, any_pose, head):
+    found = load([any_pose] * 2, rename=lambda name: {"Head": head, "Neck": "Spine3"}.get(name, name))
+    assert torch.equal(found.qpos, load([any_pose] * 2).qpos)
+
+
+@pytest.mark.parametrize("part", ["neck", "left_knee", "right_shoulder"])
+def test_no_limb_and_no_head_begins_at_the_root(load, part):
+    with pytest.raises(
+        MotionFormatError, match=rf"has its {part} on Hips, which carries the whole body: say with a map"
+    ):
+        load([{}] * 2, options={"joint_map": {part: "Hips"}})

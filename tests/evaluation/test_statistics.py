@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from torchrl_mcp.report.statistics import Estimate, deviation, interquartile_mean, mean
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean
 
 
 def test_the_mean_is_the_mean_and_the_deviation_that_of_a_sample():

@@ -1,4 +1,4 @@
-"""Point estimates over seeds, with bootstrap intervals by SciPy."""
+"""Means of episodes and seeds with bootstrap intervals, computed by SciPy."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -8,6 +8,9 @@ import numpy as np
 from scipy.stats import bootstrap, trim_mean
 
 CONFIDENCE = 0.95
+
+BATCH = 10_000_000
+"""Values that are resampled at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.nda
         vectorized=True,
         method="percentile",
         confidence_level=CONFIDENCE,
+        batch=max(1, BATCH // sum(map(len, strata))),
         rng=np.random.default_rng(0),
     ).confidence_interval
     return Estimate(value, float(interval.low), float(interval.high))

@@ -1,0 +1,55 @@
+"""What makes two runs of one, and what does not."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from torchrl_mcp import conf
+from torchrl_mcp.runs.identity import CONDUCT, LEVELS, PLACES, TRANSFER_ONLY, UNLEARNT, UNNAMED, differences, is_among
+
+TRAIN = yaml.safe_load((Path(conf.__file__).parent / "train.yaml").read_text())
+GROUPS = {name for group in TRAIN["defaults"] if isinstance(group, dict) for name in group}
+
+
+def test_hydra_leaves_the_same_settings_out_of_the_names_of_run_folders():
+    assert set(TRAIN["hydra"]["job"]["config"]["override_dirname"]["exclude_keys"]) == UNNAMED
+
+
+def test_every_level_of_a_run_folder_is_in_its_path():
+    for setting in LEVELS:
+        assert f"${{{setting}" in TRAIN["run_dir"].replace(".name", "")
+
+
+@pytest.mark.parametrize("settings", [UNNAMED, UNLEARNT - {"task.evaluation"}], ids=["unnamed", "unlearnt"])
+def test_every_setting_that_is_named_exists(settings):
+    for name in settings:
+        first, _, rest = name.partition(".")
+        assert name in GROUPS or first in TRAIN, name
+        assert not rest or rest in TRAIN[first], name
+
+
+def test_a_run_goes_on_with_another_conduct_but_with_no_other_setting():
+    held = dict.fromkeys([*CONDUCT, *PLACES, "autocast", "seed", "training"], 0)
+    assert differences(held, held) == []
+    for name in held:
+        found = differences(held, {**held, name: 1})
+        assert found == ([] if name in CONDUCT else [name])
+
+
+def test_a_setting_that_only_one_of_two_has_makes_them_differ():
+    assert differences({"seed": 0}, {"seed": 0, "latent_dim": 8}) == ["latent_dim"]
+    assert differences({"seed": 0, "latent_dim": 8}, {"seed": 0}) == ["latent_dim"]
+
+
+def test_a_setting_is_among_others_with_all_that_is_below_it_and_nothing_that_begins_alike():
+    assert is_among("evaluation.episodes", UNLEARNT)
+    assert is_among("task.evaluation.clip_end", UNLEARNT)
+    assert not is_among("task.transfer.speed", UNLEARNT)
+    assert not is_among("seeds", UNLEARNT)
+
+
+def test_pretraining_ignores_nothing_that_it_learns_from():
+    assert not any(
+        is_among(name, TRANSFER_ONLY) for name in ("training.total_frames", "num_primitives", "budget.pretrain")
+    )

@@ -1,0 +1,112 @@
+"""Which folder may import which, and who may import Hydra."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = (
+    {"distributions"},
+    {"modules"},
+    {"methods"},
+    {"objectives"},
+    {"evaluation"},
+    {"training"},
+    {"runs"},
+    {"analysis"},
+    {"report", "viewer"},
+    {"cli"},
+)
+"""Folders of ``torchrl_mcp``, of which each may import those before it."""
+RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folders}
+HYDRA = {"torchrl_mcp.runs.build", "torchrl_mcp.runs.benchmark"}
+"""Modules beside those of ``cli`` that may import Hydra: one makes what it configures, one drives its launchers."""
+WITHOUT_HYDRA = {folder for folders in ORDER[:6] for folder in folders} | {"analysis", "viewer", "envs"}
+RESTORING = {"torchrl_mcp.analysis.checkpoints"}
+"""Modules of theirs that restore runs, by way of ``runs.build``."""
+
+
+def modules():
+    """Every module by name, with its file."""
+    for package, folder in (("torchrl_mcp", "torchrl_mcp"), ("torchrl_mcp.envs", "envs")):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            inside = path.relative_to(ROOT / folder).with_suffix("").parts
+            yield ".".join([package, *(part for part in inside if part != "__init__")]), path
+
+
+MODULES = dict(modules())
+
+
+def imports(name):
+    """What a module imports: modules by name, as far as they are ours."""
+    for node in ast.walk(ast.parse(MODULES[name].read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                member = f"{node.module}.{alias.name}"
+                yield member if member in MODULES else node.module
+
+
+def folder(name):
+    return name.split(".")[1] if name.count(".") else None
+
+
+IMPORTS = {name: set(imports(name)) for name in MODULES}
+
+
+def test_every_folder_has_its_place():
+    assert {folder(name) for name in MODULES} - {None} == set(RANKS) | {"envs"}
+
+
+@pytest.mark.parametrize("name", sorted(RANKS))
+def test_a_folder_imports_none_that_builds_on_it(name):
+    for module in MODULES:
+        if folder(module) == name:
+            ranked = {other for other in IMPORTS[module] if folder(other) in RANKS and folder(other) != name}
+            above = {other for other in ranked if RANKS[folder(other)] >= RANKS[name]}
+            assert not above, f"{module} imports {above}"
+
+
+def test_environments_know_nothing_of_what_learns():
+    for module in MODULES:
+        if folder(module) == "envs":
+            ours = {other for other in IMPORTS[module] if other.startswith("torchrl_mcp")}
+            assert all(folder(other) == "envs" for other in ours), f"{module} imports {ours}"
+
+
+def test_no_modules_import_one_another_in_a_circle():
+    done = set()
+
+    def visit(module, path):
+        assert module not in path, " -> ".join([*path[path.index(module) :], module])
+        if module in done:
+            return
+        for other in sorted(IMPORTS[module] & MODULES.keys()):
+            visit(other, [*path, module])
+        done.add(module)
+
+    for module in MODULES:
+        visit(module, [])
+
+
+def test_hydra_is_imported_at_the_door_alone_and_without_its_internals():
+    using = {name for name in MODULES if any(other.split(".")[0] == "hydra" for other in IMPORTS[name])}
+    assert {name for name in using if folder(name) != "cli"} == HYDRA
+    assert not [other for name in using for other in IMPORTS[name] if "._" in other]
+
+
+def test_the_library_imports_without_hydra():
+    library = [name for name in MODULES if folder(name) in WITHOUT_HYDRA and name not in RESTORING]
+    code = (
+        "import importlib, sys\n"
+        "sys.modules['hydra'] = None\n"
+        "for name in sys.argv[1:]: importlib.import_module(name)\n"
+        "print(len(sys.argv) - 1)"
+    )
+    run = subprocess.run([sys.executable, "-c", code, *library], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert int(run.stdout) == len(library) > 80

@@ -1,0 +1,78 @@
+"""Every method, task, character and stage: what composes, and what no environment has."""
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from torchrl_mcp import conf
+from torchrl_mcp.runs.build import require_environment
+
+CONF = Path(conf.__file__).parent
+METHODS, CHARACTERS, STAGES = (
+    [path.stem for path in sorted((CONF / group).glob("*.yaml"))] for group in ("method", "character", "stage")
+)
+WALKERS = {"biped", "humanoid", "trex"}
+TASKS = {  # characters that can do it, the one it takes by default, and its stages
+    "carry": (WALKERS, "biped", {"transfer"}),
+    "dribble": (WALKERS, "biped", {"transfer"}),
+    "heading": (WALKERS, "biped", {"transfer"}),
+    "holdout": ({"ant"}, "ant", {"pretrain", "transfer"}),
+    "imitation": (WALKERS, "biped", {"pretrain"}),
+}
+
+
+def composed(*overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", [*overrides, "run_dir=never"])
+
+
+def test_there_are_no_others():
+    assert len(METHODS) == 7
+    assert set(CHARACTERS) == WALKERS | {"ant"}
+    assert {path.stem for path in (CONF / "task").glob("*.yaml")} == set(TASKS)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_task_takes_its_own_character_and_refuses_those_that_cannot_do_it_with_a_remedy(task, method):
+    able, default, stages = TASKS[task]
+    cfg = composed(f"task={task}", f"method={method}")
+    assert cfg.character.name == default
+    for character, stage in product(CHARACTERS, STAGES):
+        cfg.character, cfg.stage = (
+            OmegaConf.load(CONF / group / f"{choice}.yaml")
+            for group, choice in (("character", character), ("stage", stage))
+        )
+        if character in able and stage in stages:
+            require_environment(cfg)
+            assert OmegaConf.to_container(cfg, resolve=True)["parts"]["_target_"].startswith("torchrl_mcp.")
+            continue
+        with pytest.raises(ValueError, match="task=") as refusal:
+            require_environment(cfg)
+        remedy = "stage=transfer" if stage not in stages else f"pass character={' or '.join(sorted(able))}"
+        if task == "imitation" and stage == "transfer":
+            remedy = "task=imitation"
+        assert remedy in str(refusal.value)
+
+
+@pytest.mark.parametrize("character", sorted(WALKERS))
+def test_a_character_that_is_asked_for_wins(character):
+    assert composed("task=heading", "method=moe", f"character={character}").character.name == character
+
+
+def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
+    cfg = composed("task=heading", "task.name=juggle")
+    assert dict(cfg.training) == {
+        "num_envs": 128,
+        "frames_per_batch": 4096,
+        "minibatch_size": 512,
+        "num_epochs": 4,
+        "total_frames": 5_000_000,
+    }
+    assert cfg.optimizer.schedule.target_kl == 0.02
+    imitation = composed("task=imitation")
+    assert (imitation.training.total_frames, imitation.optimizer.schedule.target_kl) == (12_000_000, 0.05)
+    assert (composed().training.num_envs, composed().training.minibatch_size) == (64, 512)

@@ -1,0 +1,35 @@
+"""What a value function minimises."""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+
+class ValueLoss(nn.Module):
+    r"""Mean squared error of a value function against its targets.
+
+    .. math:: L = c \, \mathbb{E} \, (V(s, g) - y)^2
+
+    This is the ``loss_critic`` of TorchRL's PPO with ``loss_critic_type="l2"``, without the actor's terms, so that
+    actor and critic can learn at the same time.
+
+    Args:
+        critic_network: From ``observation`` and ``goal`` to ``state_value``.
+        coeff: Weight of the error, :math:`c`.
+    """
+
+    def __init__(self, critic_network: TensorDictModuleBase, *, coeff: float) -> None:
+        super().__init__()
+        self.critic_network, self.coeff = critic_network, coeff
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_critic`` of samples ``(B,)``, and the share of the targets' ``explained_variance``."""
+        target = tensordict["value_target"]
+        residual = target - self._values(tensordict)
+        with torch.no_grad():
+            explained = 1 - residual.var(correction=0) / target.var(correction=0).clamp_min(1e-8)
+        return TensorDict({"loss_critic": self.coeff * residual.square().mean(), "explained_variance": explained})
+
+    def _values(self, samples: TensorDictBase) -> Tensor:
+        return self.critic_network(samples.select(*self.critic_network.in_keys))["state_value"]

@@ -1,0 +1,1 @@
+"""Runs: built from configurations, trained in folders of their own, alone or as benchmarks of many."""

@@ -1,0 +1,41 @@
+"""Text tables of commands and benchmarks."""
+
+from collections.abc import Mapping, Sequence
+from io import StringIO
+
+from rich.box import MARKDOWN
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+WIDEST = 10_000
+"""Characters of a line: files and pipes have no width into which a table would have to be folded."""
+
+
+def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) -> str:
+    """Return rows as text with aligned columns, numbers to the right.
+
+    Args:
+        rows: Cells by the names of their columns, of the same names in every row. A float has three decimals; an empty
+            text is no value.
+        markdown: Draw the lines of a Markdown table.
+    """
+    table = Table(box=MARKDOWN) if markdown else plain_table()
+    for name in rows[0]:
+        numeric = all(isinstance(row[name], int | float) or row[name] == "" for row in rows)
+        table.add_column(Text(name), justify="right" if numeric else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*(Text(_cell(value)) for value in row.values()))
+    console = Console(file=StringIO(), width=WIDEST, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines()).strip("\n")
+
+
+def plain_table(caption: str | None = None) -> Table:
+    """Return an empty table without lines, with a caption below."""
+    return Table(caption=caption, caption_justify="left", box=None, padding=(0, 2, 0, 0))
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
