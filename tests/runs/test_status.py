@@ -5,11 +5,8 @@ import sys
 import pytest
 from rich.console import Console
 
-<<<<<<< HEAD
-from torchrl_mcp.runs import lock, status
-=======
 from torchrl_mcp.cli.status import main
->>>>>>> layout
+from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
