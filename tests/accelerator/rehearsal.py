@@ -27,9 +27,9 @@ from torchrl_mcp.training.trainer import Trainer
 
 SETTINGS = [
     *("preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "character=biped"),
-    *("training.frames_per_batch=32", "training.minibatch_size=16", "training.num_epochs=2"),
+    *("training.frames_per_batch=32", "training.minibatch_size=16", "training.num_epochs=3"),
 ]
-"""Eight steps of four environments and four gradient steps per iteration."""
+"""Eight steps of four environments and six gradient steps per iteration."""
 SECTIONS = {"collect": (LocalSource, "collect"), "update": (Trainer, "_update"), "save": (Trainer, "save")}
 
 

@@ -103,7 +103,7 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
     assert first.endswith(origin["precision"])
     cfg = OmegaConf.load(folder / "config.yaml")
     assert cfg.autocast is chosen
-    assert checkpoint.configuration(checkpoint.find(folder))["autocast"] is chosen
+    assert checkpoint.saved_config(checkpoint.find(folder))["autocast"] is chosen
 
     cfg.training.total_frames = 256
     OmegaConf.save(cfg, folder / "config.yaml")
