@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from torchrl_mcp import __version__
 from torchrl_mcp.runs import build, provenance
+from torchrl_mcp.training.precision import Precision
 
 
 def git(folder, *arguments):
@@ -49,8 +50,11 @@ def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tm
 
 def test_provenance_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
-    content = json.loads(json.dumps(provenance.provenance("cpu", *build.launched())))
+    command, choices = build.launched()
+    where_from = provenance.provenance("cpu", command, choices, Precision(True, "as measured"))
+    content = json.loads(json.dumps(where_from))
     assert content["command"] == ["script.py", "seed=3"]
+    assert content["precision"] == "networks in bfloat16: as measured"
     assert content["version"] == __version__
     assert abs((datetime.now(UTC) - datetime.fromisoformat(content["started"])).total_seconds()) < 60
     assert content["machine"]["torch"] == torch.__version__

@@ -1,4 +1,3 @@
-import fcntl
 import io
 import json
 import sys
@@ -7,6 +6,7 @@ import pytest
 from rich.console import Console
 
 from torchrl_mcp.cli.status import main
+from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
@@ -35,7 +35,7 @@ def runs(tmp_path):
     planned = {tmp_path / name: 1000 for name in ("finished", "killed", "alive", "later")}
     write_manifest(planned, tmp_path / "multirun" / "benchmark-x.json")
     with (alive / "train.log").open() as log:
-        fcntl.flock(log, fcntl.LOCK_EX)
+        lock.hold(log)
         yield tmp_path
 
 

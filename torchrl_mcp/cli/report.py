@@ -25,6 +25,7 @@ from torchrl_mcp.report.sections import (
     row,
     task_sections,
 )
+from torchrl_mcp.training import precision
 from torchrl_mcp.training.run_folder import replacing
 
 PAGES = ("report.html", "report.md")
@@ -114,13 +115,15 @@ def _overview(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _machine(run: Run) -> str:
-    """The machine and the libraries of a run in one line."""
+    """The machine, the precision of the networks and the libraries of a run in one line."""
     machine = run.provenance.get("machine") or {}
     parts = (
         f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
     )
+    autocast = run.settings.get("autocast")
+    networks = [f"networks in {precision.name(autocast)}"] if isinstance(autocast, bool) else []
     versions = (f"{name} {machine[name]}" for name in LIBRARIES if name in machine)
-    return ", ".join([*parts, *versions]) or "unknown"
+    return ", ".join([*parts, *networks, *versions]) or "unknown"
 
 
 def _duration(seconds: float) -> str:

@@ -6,7 +6,6 @@ waits for another). A run is its folder, whose configuration says what it is, so
 over runs that are complete, goes on with those that are not, and refuses a folder of other settings.
 """
 
-import fcntl
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, lock
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.training.run_folder import CONFIG, LOG
@@ -215,7 +214,7 @@ def run(cfg: DictConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOG).open("a", buffering=1) as log:
         # Where another process trains this run, wait for it. The lock also shows that the run is alive.
-        fcntl.flock(log, fcntl.LOCK_EX)
+        lock.hold(log)
         with redirect_stdout(log), redirect_stderr(log):
             try:
                 if (folder / CONFIG).exists():

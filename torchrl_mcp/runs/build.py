@@ -140,11 +140,12 @@ def make_source(cfg: DictConfig) -> TrajectorySource:
 
 
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:
-    """Return the trainer of an agent.
+    """Return the trainer of an agent; ``cfg.autocast`` is true or false, what :func:`.precision.choose` chose.
 
     A method whose samples last for several steps, such as choices, names a ``batch_factor`` by which its batches are
     larger than ``training.frames_per_batch``.
     """
+    assert isinstance(cfg.autocast, bool)
     trainable = {
         "actor": [p for p in agent.actor.trained.parameters() if p.requires_grad],
         "critic": list(agent.parts["critic"].parameters()),

@@ -1,5 +1,6 @@
 """The life of a run: trained in a folder of its own, resumed, restored, evaluated and published."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any, cast
@@ -16,14 +17,18 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.build import Agent, make_agent, make_env, make_source, make_trainer
 from torchrl_mcp.runs.builtin import builtin, publish
+from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import provenance
 from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.precision import choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, replacing, write_json
 from torchrl_mcp.training.trainer import Trainer
 
 
 def train(cfg: DictConfig) -> Path:
     """Train from the start in the run folder ``cfg.run_dir``, evaluate the policy, and return the folder.
+
+    The folder's configuration holds the precision that was chosen, where ``cfg.autocast`` leaves it to the machine.
 
     Raises:
         ValueError: If the folder holds a run already, there is no environment for the configured task and character, or
@@ -33,10 +38,13 @@ def train(cfg: DictConfig) -> Path:
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
     build.require_environment(cfg)
-    trainer = _trainer(cfg, folder, _pretrained(cfg))
+    pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
+    print(f"{folder}: {precision}", flush=True)
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
+    trainer = _trainer(cfg, folder, pretrained)
     folder.mkdir(parents=True, exist_ok=True)
     trainer.save()
-    write_json(provenance(cfg.device, *build.launched()), folder / PROVENANCE)
+    write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)
     # Last, because it is what says that there is a run to resume.
     with replacing(folder / CONFIG) as partial:
         OmegaConf.save(cfg, partial, resolve=True)
@@ -47,7 +55,7 @@ def train(cfg: DictConfig) -> Path:
 def resume(folder: Path) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with the configuration it began with.
 
-    A run that :func:`is_complete` is left as it is.
+    A run that :func:`is_complete` is left as it is. On another machine it keeps the precision that it began with.
 
     Raises:
         ValueError: If the folder holds no run, or its checkpoint is damaged.
@@ -55,6 +63,7 @@ def resume(folder: Path) -> Path:
     if is_complete(folder):
         return folder
     cfg, newest = run_config(folder), checkpoint.find(folder)
+    print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
     if checkpoint.frames(newest):
         trainer = _trainer(cfg, folder)
         trainer.restore(newest)
@@ -218,6 +227,19 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
     source = make_source(cfg)
     agent = make_agent(cfg, source.env, pretrained)
     return make_trainer(cfg, agent, source, folder)
+
+
+def _precision_kept(cfg: DictConfig, folder: Path) -> str:
+    """Return in which precision a run goes on, and whether it began on another machine."""
+    precision = name(choose(cfg.autocast, cfg.device).autocast)
+    began = json.loads((folder / PROVENANCE).read_text())["machine"] if (folder / PROVENANCE).is_file() else {}
+    now = machine(cfg.device)
+    if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
+        return f"goes on with networks in {precision}"
+    return (
+        f"began on {began['processor']} ({began['device']}) and goes on on {now['processor']} ({now['device']}), with "
+        f"networks in {precision} as it began"
+    )
 
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:

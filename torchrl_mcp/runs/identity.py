@@ -36,6 +36,9 @@ TRANSFER_ONLY = frozenset(
 )
 """Settings that make no difference to pre-training, or that it refuses."""
 
+LEFT_OPEN = {"autocast": "auto"}
+"""Values that leave a setting to the machine, so that any value agrees with them."""
+
 
 def is_among(name: str, settings: Collection[str]) -> bool:
     """Tell whether a setting is one of ``settings``, or below one.
@@ -52,5 +55,6 @@ def differences(held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Col
     >>> differences({"seed": 0, "device": "cpu"}, {"seed": 1, "device": "cuda"})
     ['seed']
     """
+    agreed = {*ignored, *(key for key, value in LEFT_OPEN.items() if wanted.get(key) == value)}
     keys = dict.fromkeys([*held, *wanted])
-    return [key for key in keys if key not in ignored and held.get(key) != wanted.get(key)]
+    return [key for key in keys if key not in agreed and held.get(key) != wanted.get(key)]

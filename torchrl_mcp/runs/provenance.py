@@ -9,27 +9,31 @@ from typing import Any
 
 from torchrl_mcp import __version__
 from torchrl_mcp.runs.machine import machine
+from torchrl_mcp.training.precision import Precision
 
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def provenance(device: str, command: Sequence[str], choices: Mapping[str, str]) -> dict[str, Any]:
+def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision) -> dict[str, Any]:
     """Return where a run comes from, JSON-compatible.
 
     Args:
         device: Where its networks are.
         command: The words of the command that began it.
         choices: The choice of each group of its configuration.
+        precision: What its networks compute in.
 
     Returns:
         ``command``; ``commit`` of the library, with ``-dirty`` where files were changed since, or None where it is no
-        checkout; its ``version``; ``choices``; ``started``, an ISO time; and the ``machine``.
+        checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``started``, an ISO time; and the
+        ``machine``.
     """
     return {
         "command": list(command),
         "commit": commit(PACKAGE),
         "version": __version__,
         "choices": dict(choices),
+        "precision": str(precision),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": machine(device),
     }

@@ -4,7 +4,6 @@ Everything is read from the run folders, so it works beside a benchmark in any p
 """
 
 import csv
-import fcntl
 import json
 import os
 import sys
@@ -22,6 +21,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, write_json
 
@@ -112,7 +112,7 @@ def status(run: Path, total: int | None = None) -> Status:
     if (run / EVALUATION).exists():
         evaluation = json.loads((run / EVALUATION).read_text())
         return Status(run, "done", frames, total, speed, evaluation["deterministic"]["normalised_return"])
-    if _is_locked(run / LOG):
+    if (run / LOG).exists() and lock.is_held(run / LOG):  # by the process that trains it
         return Status(run, "running", frames, total, speed, score)
     if frames >= total and not _plan(run)[1]:
         return Status(run, "done", frames, total, speed, score)
@@ -188,15 +188,3 @@ def _last_row(path: Path) -> dict[str, float]:
         return {}
     row = next(csv.DictReader([names, whole[-1]]))
     return {name: float(value) for name, value in row.items()}
-
-
-def _is_locked(path: Path) -> bool:
-    """Tell whether a process trains the run whose log this is."""
-    if not path.exists():
-        return False
-    with path.open() as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False

@@ -279,5 +279,7 @@ def _spread(distribution: Distribution) -> dict[str, float]:
 
 
 def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
-    """Average scalars over reports of the same keys."""
-    return {key: torch.stack([report[key] for report in reports]).mean().item() for key in reports[0].keys()}  # noqa: SIM118
+    """Average scalars over reports of the same keys, and fetch them from the device all at once."""
+    keys = list(reports[0].keys())
+    means = torch.stack([torch.stack([report[key] for report in reports]).mean() for key in keys])
+    return dict(zip(keys, means.tolist(), strict=True))

@@ -1,0 +1,196 @@
+"""How training scales: measured here with environments, threads and workers, predicted for other machines.
+
+    python benchmarks/scaling.py            # minutes, writes results/scaling.csv and results/scaling_model.csv
+    python benchmarks/scaling.py --quick    # a minute, writes nothing unless given --output
+
+Measured are whole iterations of MCP on the humanoid's heading task with the primitives that come with the library, in
+the precision that ``autocast=auto`` takes. From the seconds of their sections the model's constants are fitted:
+
+    iteration = T * (physics * N / speed-up + forward + forward' * N + rest + rest' * N) + update * N * T / speed-up
+
+with ``N`` environments and ``T`` steps of each. Forward pass and rest keep to one thread. Speed-ups follow Amdahl's law
+with the serial share that one and two threads show here. A GPU takes over forward pass and update: its time is that of
+starting its operations, which are counted here, or of their arithmetic, whichever is longer, plus the transfers. What
+is assumed of it is in ``GPU``.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_module
+from report import about, table, write
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from torchrl_mcp.runs import build
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.training.precision import choose
+from torchrl_mcp.training.trainer import Trainer
+
+RESULTS = Path(__file__).resolve().parent / "results" / "scaling.csv"
+SIZES, QUICK_SIZES = (64, 256, 1024, 4096), (16, 64)
+STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 4, 512
+"""Control steps and iterations of a measurement, the first to warm up; passes over its samples, in minibatches."""
+SECTIONS = ("physics", "forward", "collection", "update", "other")
+GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
+"""Assumed: starts of operations from Python, arithmetic in practice, and a small transfer. The last is waited for."""
+TRANSFERS = 5
+"""Transfers of a control step, as tests/accelerator counts them for this task."""
+MACHINES = {"2 cores": (2, False), "8 cores": (8, False), "64 cores": (64, False), "8 cores, GPU": (8, True),
+            "64 cores, GPU": (64, True)}  # fmt: skip
+
+
+class Operations(TorchDispatchMode):
+    """Counts operations, each of which a GPU would have to be told to start."""
+
+    count = 0
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        """Count, and do it."""
+        self.count += 1
+        return operation(*args, **(kwargs or {}))
+
+
+def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
+    """Return the trainer of some iterations, with threads of physics and torch, or workers of a thread each."""
+    collector = f"collector={'processes' if workers else 'local'}"
+    settings = {
+        "character": "humanoid",
+        "task": "heading",
+        "stage": "transfer",
+        "logger": "none",
+        "training.num_envs": num_envs,
+        "training.frames_per_batch": num_envs * STEPS,
+        "training.minibatch_size": min(MINIBATCH, num_envs * STEPS),
+        "training.num_epochs": EPOCHS,
+        "training.total_frames": num_envs * STEPS * ITERATIONS,
+        "checkpoint_interval": 10**9,
+        "autocast": choose("auto", "cpu").autocast,
+        "num_threads": threads,
+        "progress_bar": False,
+        "run_dir": ".",
+    }
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        cfg = compose("train", [collector, *(f"{key}={value}" for key, value in settings.items())])
+    if workers:
+        cfg.collector.num_workers = workers
+    source = build.make_source(cfg)
+    agent = build.make_agent(cfg, source.env, builtin("mcp", "humanoid"))
+    return build.make_trainer(cfg, agent, source, Path(cfg.run_dir))
+
+
+class Record:
+    """Takes the place of files: keeps metrics in memory, and writes no checkpoint."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, float]] = []
+
+    def write(self, metrics: dict[str, float], *, step: int) -> None:
+        """Keep a row."""
+        self.rows.append(metrics)
+
+
+def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
+    """Return samples per second and the seconds of an iteration's sections, the first left out."""
+    torch.set_num_threads(threads)
+    trainer = make_trainer(num_envs, threads, workers)
+    record = Record()
+    trainer.metrics_writer = record  # type: ignore[assignment]
+    trainer.save = lambda: None  # type: ignore[method-assign]
+    trainer.run()
+    rows = record.rows[1:]
+    seconds = [num_envs * STEPS / row["time/steps_per_second"] for row in rows]
+    sections = {
+        f"{name}_seconds": round(
+            np.mean([row.get(f"time/{name}", 0.0) * s for row, s in zip(rows, seconds, strict=True)]), 5
+        )
+        for name in SECTIONS
+    }
+    samples = round(num_envs * STEPS / float(np.mean(seconds)))
+    return {"num_envs": num_envs, "threads": threads, "workers": workers, "samples_per_second": samples, **sections}
+
+
+def count() -> dict[str, float]:
+    """Return operations and FLOPs of the policy's forward pass and of a gradient step, the latter's per sample."""
+    trainer, counts = make_trainer(MINIBATCH, 1, 0), {}
+    batch = trainer.source.env.fake_tensordict().expand(MINIBATCH).clone()
+    with torch.no_grad(), Operations() as operations, FlopCounterMode(display=False) as flops:
+        trainer.actor.policy(batch)
+    counts |= {"forward_operations": operations.count, "forward_flops": flops.get_total_flops() / MINIBATCH}
+    batch = batch.update({"advantage": torch.zeros(MINIBATCH, 1), "value_target": torch.zeros(MINIBATCH, 1)})
+    batch = batch.update({"state_value": torch.zeros(MINIBATCH, 1)})
+    with Operations() as operations, FlopCounterMode(display=False) as flops:
+        for name in trainer.optimizers:
+            trainer._learn(name, batch, [torch.arange(MINIBATCH)])
+    return counts | {"step_operations": operations.count, "step_flops": flops.get_total_flops() / MINIBATCH}
+
+
+def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the model's constants: seconds per control step and sample on one thread, and serial shares."""
+    one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
+    constants: dict[str, float] = {}
+    for name in ("forward", "other"):
+        sizes = [row["num_envs"] for row in one]
+        slope, constant = np.polyfit(sizes, [row[f"{name}_seconds"] / STEPS for row in one], 1, w=1 / np.array(sizes))
+        constants |= {f"{name}_per_step": max(constant, 0.0), f"{name}_per_sample": slope}
+    for name in ("physics", "update"):
+        speeds = [np.median([row[f"{name}_seconds"] / row["num_envs"] / STEPS for row in some]) for some in (one, two)]
+        constants |= {
+            f"{name}_per_sample": speeds[0],
+            f"{name}_serial": float(np.clip(2 * speeds[1] / speeds[0] - 1, 0, 1)),
+        }
+    return {name: float(value) for name, value in constants.items()}
+
+
+def predict(num_envs: int, cores: int, gpu: bool, c: dict[str, float]) -> float:
+    """Return samples per second of ``cores`` cores, with or without a GPU, by the model's constants."""
+
+    def speed_up(name: str) -> float:
+        return 1 / (c[f"{name}_serial"] + (1 - c[f"{name}_serial"]) / cores)
+
+    samples = num_envs * STEPS
+    physics = samples * c["physics_per_sample"] / speed_up("physics")
+    rest = STEPS * c["other_per_step"] + samples * c["other_per_sample"]
+    if not gpu:
+        forward = STEPS * c["forward_per_step"] + samples * c["forward_per_sample"]
+        return samples / (physics + rest + forward + samples * c["update_per_sample"] / speed_up("update"))
+    starts, rate = GPU["operations_per_second"], GPU["flops"]
+    forward = STEPS * max(c["forward_operations"] / starts, num_envs * c["forward_flops"] / rate)
+    forward += STEPS * TRANSFERS * GPU["seconds_per_transfer"]
+    steps = EPOCHS * max(samples / MINIBATCH, 1)
+    update = steps * max(c["step_operations"] / starts, min(MINIBATCH, samples) * c["step_flops"] / rate)
+    return samples / (physics + rest + forward + update)
+
+
+def main() -> None:
+    """Measure, fit, predict, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--output", type=Path)
+    arguments = parser.parse_args()
+    sizes = QUICK_SIZES if arguments.quick else SIZES
+    rows = [measure(size, threads, 0) for size in sizes for threads in (1, 2)]
+    rows += [measure(size, 1, workers) for size in sizes[1:3] for workers in (1, 2)]
+    constants = fit(rows) | count()
+    predictions = [
+        {"machine": name, "num_envs": size, "samples_per_second": round(predict(size, cores, gpu, constants))}
+        for name, (cores, gpu) in MACHINES.items()
+        for size in sizes
+    ]
+    print(table(rows), table(predictions), *(f"{name} {value:.4g}" for name, value in constants.items()), sep="\n")
+    if output := arguments.output or (None if arguments.quick else RESULTS):
+        machine = about()
+        write(output, [row | machine for row in rows])
+        model = [{"name": name, "value": f"{value:.6g}"} for name, value in (constants | GPU).items()]
+        model += [
+            {"name": f"{p['machine']}, {p['num_envs']} environments", "value": p["samples_per_second"]}
+            for p in predictions
+        ]
+        write(output.with_name(f"{output.stem}_model.csv"), model)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Whether networks run in bfloat16 or in float32: whichever the machine computes faster.
+
+``autocast=auto`` decides once, when a run begins, and the run keeps the choice. What torch says of the device decides
+where it is certain:
+
+=================================================  ==================================================
+device                                             choice
+=================================================  ==================================================
+x86 processor with AMX tiles of bfloat16           bfloat16
+x86 processor with neither AMX nor AVX512-BF16     float32: oneDNN would emulate it
+CUDA or ROCm device                                bfloat16 from compute capability 8 (Ampere) on
+every other                                        by timing one matrix product in both
+=================================================  ==================================================
+
+AVX512-BF16 alone is timed as well: some processors that have it compute bfloat16 at twice the rate of float32 and
+others at half of it. So are processors by Arm, where the answer depends on how torch was built.
+"""
+
+import time
+import warnings
+from dataclasses import dataclass
+from statistics import median
+
+import torch
+
+ADVANTAGE = 0.8
+"""Largest time of a product in bfloat16, relative to float32, at which the lower precision is worth having."""
+SHAPE = (256, 1024, 1024)
+"""Rows, inputs and outputs of the product that is timed: a small batch in a wide layer."""
+REPEATS = 5
+
+
+@dataclass(frozen=True)
+class Precision:
+    """What a run's networks compute in.
+
+    Attributes:
+        autocast: Whether matrix products are in bfloat16.
+        reason: Why, in a few words.
+    """
+
+    autocast: bool
+    reason: str
+
+    def __str__(self) -> str:
+        """Return the precision and the reason, as logs show them."""
+        return f"networks in {name(self.autocast)}: {self.reason}"
+
+
+def name(autocast: bool) -> str:
+    """Return what the precision is called."""
+    return "bfloat16" if autocast else "float32"
+
+
+def choose(autocast: bool | str, device: torch.device | str) -> Precision:
+    """Return the precision of networks on a device, and warn if bfloat16 is asked for and slower.
+
+    Args:
+        autocast: True or False to have it so, or ``auto`` for the faster.
+        device: Where the networks are.
+
+    Raises:
+        ValueError: If ``autocast`` is anything else.
+    """
+    if autocast != "auto" and not isinstance(autocast, bool):
+        raise ValueError(f"autocast={autocast!r} must be auto, true or false")
+    if autocast is False:
+        return Precision(False, "autocast=false")
+    told = is_native(device)
+    if autocast is True:
+        if not told and (ratio := relative_time(device)) > 1:
+            warnings.warn(
+                f"autocast=true: on this {_kind(device)} a matrix product takes {ratio:.1f} times as long in bfloat16 "
+                "as in float32; autocast=auto would choose the faster",
+                stacklevel=2,
+            )
+        return Precision(True, "autocast=true")
+    if told is not None:
+        return Precision(told, f"this {_kind(device)} has {'' if told else 'no '}instructions for bfloat16")
+    ratio = relative_time(device)
+    return Precision(ratio <= ADVANTAGE, f"bfloat16 takes {ratio:.2f} times as long on this {_kind(device)}")
+
+
+def is_native(device: torch.device | str) -> bool | None:
+    """Tell whether a device multiplies matrices of bfloat16 faster than of float32, None where torch does not say."""
+    kind = torch.device(device).type
+    if kind == "cuda":
+        with torch.cuda.device(device):
+            return torch.cuda.is_bf16_supported(including_emulation=False)
+    if kind != "cpu":
+        return None
+    features = torch.cpu.get_capabilities()
+    if not features["architecture"].startswith("x86"):
+        return None
+    if features["amx_bf16"]:
+        return True
+    return None if features["avx512_bf16"] else False
+
+
+def relative_time(device: torch.device | str) -> float:
+    """Return the time of a matrix product in bfloat16, relative to float32, on one thread of a processor."""
+    rows, inputs, outputs = SHAPE
+    operands = torch.ones(rows, inputs, device=device), torch.ones(outputs, inputs, device=device)
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # another run may have the other cores
+    try:
+        low, full = (_seconds(*(x.to(dtype) for x in operands)) for dtype in (torch.bfloat16, torch.float32))
+    finally:
+        torch.set_num_threads(num_threads)
+    return low / full
+
+
+def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
+    """Return the median time of ``rows @ weight.T``, after a first one that prepares the kernels."""
+    times = []
+    for _ in range(1 + REPEATS):
+        _wait(rows.device)
+        start = time.perf_counter()
+        torch.nn.functional.linear(rows, weight)
+        _wait(rows.device)
+        times.append(time.perf_counter() - start)
+    return median(times[1:])
+
+
+def _wait(device: torch.device) -> None:
+    """Wait until an accelerator has done what it was given."""
+    if device.type != "cpu":
+        torch.accelerator.synchronize(device)
+
+
+def _kind(device: torch.device | str) -> str:
+    return "processor" if torch.device(device).type == "cpu" else "device"
