@@ -120,7 +120,7 @@ class Cell:
             *(["one seed, so that the interval is over its episodes"] if len(self.complete) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(f"mixed {found}" for found in _mixed("evaluations", map(_protocol, self.complete))),
-            *([f"trained with {', '.join(practice)}"] if (practice := self.runs[0].practice) else []),
+            *(f"trained with practice={self.choices['practice']}: {used}" for used in self.runs[0].practice),
         ]
 
 

@@ -113,7 +113,7 @@ class Run:
 
     @property
     def practice(self) -> list[str]:
-        """Settings of the environment in transfer that are not those of the evaluation, as ``name=value``."""
+        """Settings of the environment in transfer that are not those of the evaluation: a line, or none."""
         if self.stage != "transfer":
             return []
         trained, evaluated = (
@@ -121,7 +121,8 @@ class Run:
             for prefix in ("task.transfer.", "task.evaluation.")
         )
         shared = (name for name in trained if name in evaluated or name.startswith("shaping."))
-        return [f"{name}={trained[name]}" for name in shared if trained[name] != evaluated.get(name)]
+        different = [f"{name}={trained[name]}" for name in shared if trained[name] != evaluated.get(name)]
+        return [", ".join(different)] if different else []
 
     @property
     def progress(self) -> float:
