@@ -155,8 +155,8 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     assert not any(remark.startswith("trained with") for remark in plain.remarks)
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
-        "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, mixture=[{'weight': 2}], "
-        "shaping.object.slope=1.0"
+        "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, "
+        "mixture=[{'weight': 2}], shaping.object.slope=1.0"
     )
 
 
