@@ -32,7 +32,7 @@ from torchrl_mcp.training.trainer import Trainer
 
 RESULTS = Path(__file__).resolve().parent / "results" / "scaling.csv"
 SIZES, QUICK_SIZES = (64, 256, 1024, 4096), (16, 64)
-STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 4, 512
+STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 2, 512
 """Control steps and iterations of a measurement, the first to warm up; passes over its samples, in minibatches."""
 SECTIONS = ("physics", "forward", "collection", "update", "other")
 GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
