@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.rewards import carry_reward
 from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
-from torchrl_mcp.envs.transport import Transport, clear_of, mocap_positions
+from torchrl_mcp.envs.transport import Transport, mocap_positions
 
 MASS = 5.0
 """Of the box, in kg. Paper: 5."""
@@ -22,32 +22,38 @@ TOP_THICKNESS = 0.03
 DROP = 0.05
 """Metres by which the target's top is lower than the source's: a box carried as it was found passes over it."""
 
+TOP_CONTACT = 2
+"""Bit of MuJoCo's contact types for the tops, which the box alone has: to characters, tops would be a wall."""
+
 RESTING_GAP = 0.01
 """Metres between box and top up to which the box stands on it."""
+
+RELEASE_GAP = DROP + RESTING_GAP
+"""Metres between box and top up to which the joint lets the box down: a box carried as it was found is low enough."""
 
 
 class Carry(Transport):
     """A character takes a box from a source table to a target table.
 
     The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then holds the box
-    as it is. The joint opens once the box stands on the target, and does not close again within the episode. *Stands*
-    means that the centre of the box is over the top, and its lowest point less than 1 cm. A box that was knocked off
-    the source cannot be taken.
+    as it is. The joint opens once the box is over the target, less than 6 cm above it, and does not close again within
+    the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest point is
+    less than 1 cm above it. A box that was knocked off the source cannot be taken. ``success`` means that the box was
+    taken, is held no more, and stands on the target.
 
     ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
     angular velocity of the box. The positions of the tables are those of the middle of their tops. See
-    :class:`~torchrl_mcp.envs.transport.Transport` for ``success`` and the variants of the reward.
+    :class:`~torchrl_mcp.envs.transport.Transport` for the variants of the reward.
 
-    The source is as high as it takes for the box to be level with the carrier's centre of mass in the rest pose. The
-    legs of the tables are there to be seen; feet pass through them. So does the carrier through the box: contact would
-    work against the joint.
+    The source is as high as it takes for the box to be level with the carrier's centre of mass in the rest pose. Tables
+    hold the box; characters pass through them, for a top at the height of a waist is a wall. So does the carrier
+    through the box: contact would work against the joint.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.transport.Transport`: distances, reward and time limit. The
-            paper's distances begin at 0; here where neither tables nor character overlap. A target drawn inside the
-            character goes to the other side of the source.
+            paper's distances begin at 0; here where the box touches no character and the tables stand apart.
 
     Raises:
         ValueError: If an argument is out of range, or the character has no carrier.
@@ -74,10 +80,9 @@ class Carry(Transport):
             **kwargs,
         )
         model, outputs, state = self.simulation.model, self.simulation.outputs, self.simulation.state
-        width, (target, source) = math.sqrt(2) * HALF_SIZE, mocap_positions(model)[:, 2].tolist()
-        self._clearance = width + self._extent(target - TOP_THICKNESS, source + 2 * HALF_SIZE)
-        self.object_distances = clear_of("object_distances", self.object_distances, self._clearance)
-        self.target_distances = clear_of("target_distances", self.target_distances, 2 * width)
+        width, source = math.sqrt(2) * HALF_SIZE, float(mocap_positions(model)[1, 2])
+        self.ranges.keep_clear("object_distances", width + self._extent(source, source + 2 * HALF_SIZE))
+        self.ranges.keep_clear("target_distances", 2 * width)
         # Live views, made once.
         carrier = model.body(self.character.carrier).id
         self._carrier = outputs["xpos"][:, carrier], outputs["xquat"][:, carrier]
@@ -99,11 +104,8 @@ class Carry(Transport):
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         start = super()._sample(num)
-        root, box = start["qpos"][:, :2], start["qpos"][:, -7:]
-        target, source = start["mocap_pos"].unbind(1)
-        source[:, :2] = box[:, :2]
-        blocked = torch.linalg.vector_norm(target[:, :2] - root, dim=-1) < self._clearance
-        target[blocked, :2] = 2 * source[blocked, :2] - target[blocked, :2]
+        box = start["qpos"][:, -7:]
+        start["mocap_pos"][:, 1, :2] = box[:, :2]
         turns = about_z(2 * math.pi * torch.rand(num, 2, dtype=torch.float64, generator=self.generator))
         box[:, 3:] = turns[:, 1]
         return {**start, "mocap_quat": turns}
@@ -111,25 +113,36 @@ class Carry(Transport):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "taken": torch.zeros(len(ids))}
 
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        judged = super()._reward_and_termination(diverged)
+    def _task_reward(self) -> Tensor:
+        reward = super()._task_reward()
         touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
-        closing, opening = self._standing(touching, "source"), self._standing(self._joined == 1, "target")
+        closing = self._over(touching, "source", RESTING_GAP)
+        opening = self._over(self._joined == 1, "target", RELEASE_GAP)
         if len(closing):
             self._joint[closing] = relative_pose(*(part[closing] for part in (*self._carrier, *self._box)))
             self._joined[closing] = self.episode["taken"][closing] = 1
         self._joined[opening] = 0
-        return judged
+        return reward
 
-    def _standing(self, candidates: Tensor, table: str) -> Tensor:
-        """The simulations among ``candidates``, ``(N,)`` bool, in which the box stands on a table, ``(n,)``."""
+    def success(self) -> Tensor:
+        """Whether the box was taken, is held no more and stands on the target, shape ``(N,)``, bool."""
+        put_down = (self.episode["taken"] == 1) & (self._joined == 0)
+        success = torch.zeros_like(put_down)
+        success[self._over(put_down, "target", RESTING_GAP)] = True
+        return success
+
+    def _over(self, candidates: Tensor, table: str, gap: float) -> Tensor:
+        """The simulations among ``candidates``, ``(N,)`` bool, in which the box is over a table, ``(n,)``.
+
+        Its lowest point is less than ``gap`` metres above the top.
+        """
         ids = candidates.nonzero().squeeze(-1)
         if not len(ids):
             return ids
         position, orientation = (part[ids, list(self._shown).index(table)] for part in self._things[:2])
         from_middle = rotate(inverse(orientation), self._object[ids] - position)
-        gap = from_middle[:, 2] - HALF_SIZE * self._vertical[ids].abs().sum(-1)
-        return ids[(from_middle[:, :2].abs() < TOP_HALF_SIZE).all(-1) & (from_middle[:, 2] > 0) & (gap < RESTING_GAP)]
+        above = from_middle[:, 2] - HALF_SIZE * self._vertical[ids].abs().sum(-1)
+        return ids[(from_middle[:, :2].abs() < TOP_HALF_SIZE).all(-1) & (from_middle[:, 2] > 0) & (above < gap)]
 
 
 def relative_pose(position: Tensor, orientation: Tensor, other_position: Tensor, other_orientation: Tensor) -> Tensor:
@@ -151,7 +164,7 @@ def add_table(spec: mujoco.MjSpec, name: str, height: float, rgba: tuple[float, 
     table, box = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, height]), mujoco.mjtGeom.mjGEOM_BOX
     top, leg = TOP_THICKNESS / 2, (height - TOP_THICKNESS) / 2
     size = [TOP_HALF_SIZE, TOP_HALF_SIZE, top]
-    table.add_geom(type=box, size=size, pos=[0, 0, -top], rgba=rgba, contype=1, conaffinity=0)
+    table.add_geom(type=box, size=size, pos=[0, 0, -top], rgba=rgba, contype=TOP_CONTACT, conaffinity=0)
     place = [0, 0, leg - height]
     table.add_geom(type=box, size=[0.02, 0.02, leg], pos=place, rgba=rgba, contype=0, conaffinity=0)
 
@@ -167,7 +180,7 @@ def add_box(spec: mujoco.MjSpec, height: float) -> None:
         mass=MASS,
         rgba=[0.76, 0.6, 0.38, 1],
         contype=1,
-        conaffinity=1,
+        conaffinity=1 | TOP_CONTACT,
     )
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.rewards import dribble_reward
-from torchrl_mcp.envs.transport import SUCCESS_DISTANCE, Transport, clear_of
+from torchrl_mcp.envs.transport import SUCCESS_DISTANCE, Transport
 
 # Radius, mass, friction and damping of the ball: those of the same authors' public code.
 RADIUS = 0.2
@@ -66,7 +66,7 @@ class Dribble(Transport):
             **kwargs,
         )
         clearance = self._extent(0.0, 2 * RADIUS) + RADIUS
-        self.object_distances = clear_of("object_distances", self.object_distances, clearance)
+        self.ranges.keep_clear("object_distances", clearance)
         self._make_specs()
 
     def success(self) -> Tensor:

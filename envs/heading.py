@@ -6,13 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import interval, not_negative
-from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import heading_reward
+from torchrl_mcp.envs.transfer import TransferTask
 
 
-class Heading(PDCharacterEnv):
+class Heading(TransferTask):
     r"""A character walks at a given speed in a direction that wanders.
 
     .. math:: \hat{\theta}_t = \hat{\theta}_{t-1} + \mathrm{Uniform}(-\delta, \delta)
@@ -28,7 +28,7 @@ class Heading(PDCharacterEnv):
         initial_directions: Range (lo, hi) of the first direction, in radians from where the character faces. The paper
             does not say; its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -56,10 +56,13 @@ class Heading(PDCharacterEnv):
     ) -> None:
         not_negative(max_turn=max_turn, speed=speed)
         self.max_turn, self.speed = max_turn, speed
-        self.initial_directions = interval("initial_directions", initial_directions)
-        direction = torch.zeros((), dtype=torch.float64)
         super().__init__(
-            character, num_envs, max_episode_steps=max_episode_steps, episode={"direction": direction}, **kwargs
+            character,
+            num_envs,
+            ranges={"initial_directions": initial_directions},
+            max_episode_steps=max_episode_steps,
+            episode={"direction": torch.zeros((), dtype=torch.float64)},
+            **kwargs,
         )
         self._make_specs()
 
@@ -72,21 +75,18 @@ class Heading(PDCharacterEnv):
         return episode_return / self.max_episode_steps
 
     def _sample(self, num: int) -> dict[str, Tensor]:
-        direction = torch.empty(num, dtype=torch.float64)
-        return {
-            **super()._sample(num),
-            "direction": direction.uniform_(*self.initial_directions, generator=self.generator),
-        }
+        drawn = self.ranges.draw(num, self.generator)
+        return {**super()._sample(num), "direction": drawn["initial_directions"]}
 
-    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+    def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:
         angle = self.heading(ids)
         return {"observation": self._state(ids, angle), "goal": unit_vector(self.episode["direction"][ids] - angle)}
 
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+    def _task_reward(self) -> Tensor:
         direction = self.episode["direction"]
         reward = heading_reward(self._com_velocity(), unit_vector(direction), self.speed)
         direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
-        return self._unless_fallen(reward)
+        return reward
 
     def _arrows(self, index: int) -> list[Arrow]:
         tail = self._com[index] + torch.tensor([0.0, 0.0, 0.8])

@@ -10,17 +10,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import interval, not_negative
+from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
-from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering import Arrow
+from torchrl_mcp.envs.transfer import TransferTask
 
 SUCCESS_DISTANCE = 0.5
 """Metres between object and target from which the task counts as done; so in the same authors' public code."""
 
+ANY_DIRECTION = (-math.pi, math.pi)
+"""All directions, in radians."""
 
-class Transport(PDCharacterEnv):
+
+class Transport(TransferTask):
     """A character moves an object to a target; distances and directions are drawn uniformly for each episode.
 
     ``goal`` shows the things of the scene in the character's heading frame, positions relative to the root;
@@ -42,18 +45,24 @@ class Transport(PDCharacterEnv):
         reward: :func:`~torchrl_mcp.envs.rewards.transport_reward` with the task's constants.
         object_distances: Range (lo, hi) of the object's distance from the character, in metres; lo is raised to where
             they do not overlap.
+        object_directions: Range (lo, hi) of the direction of the object, in radians from where the character faces.
         target_distances: Range (lo, hi) of the target's distance from the object, in metres.
+        target_directions: Range (lo, hi) of the direction from the object to the target, in radians from the direction
+            in which the object lies: 0 is beyond the object.
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Give the reward 1 while successful.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: What the task remembers beside the object's position.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`: what training may use. Shaping knows
+            two distances: ``object``, from the character to the object, and ``target``, from there to the target.
 
     Raises:
         ValueError: If an argument is out of range.
     """
+
+    distances = ("object", "target")
 
     def __init__(
         self,
@@ -64,7 +73,9 @@ class Transport(PDCharacterEnv):
         furnish: Callable[[mujoco.MjSpec], None],
         reward: Callable[..., Tensor],
         object_distances: Sequence[float] = (0.0, 10.0),
+        object_directions: Sequence[float] = ANY_DIRECTION,
         target_distances: Sequence[float] = (0.0, 10.0),
+        target_directions: Sequence[float] = ANY_DIRECTION,
         speed: float = 1.0,
         target_distance_power: float = 2,
         success_reward: bool = False,
@@ -75,8 +86,6 @@ class Transport(PDCharacterEnv):
         not_negative(speed=speed)
         if target_distance_power not in (1, 2):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
-        self.object_distances = distance_range("object_distances", object_distances)
-        self.target_distances = distance_range("target_distances", target_distances)
         self.success_reward = success_reward
         self.goal_layout = goal_layout(things)
         """Where to find each quantity in ``goal``, by name."""
@@ -85,11 +94,18 @@ class Transport(PDCharacterEnv):
         super().__init__(
             character,
             num_envs,
+            ranges={
+                "object_distances": object_distances,
+                "object_directions": object_directions,
+                "target_distances": target_distances,
+                "target_directions": target_directions,
+            },
             max_episode_steps=max_episode_steps,
             episode={"object": torch.zeros(3, dtype=torch.float64), **(episode or {})},
             furnish=furnish,
             **kwargs,
         )
+        self.ranges.require_distances("object_distances", "target_distances")
         # Live views, made once. The things follow the character's bodies.
         rows, outputs = slice(1 + len(self._bodies), None), self.simulation.outputs
         angular, linear = outputs["cvel"][:, rows].split(3, -1)
@@ -110,27 +126,22 @@ class Transport(PDCharacterEnv):
         return torch.linalg.vector_norm((self._object - self._target)[:, :2], dim=-1) < SUCCESS_DISTANCE
 
     def _extent(self, low: float, high: float) -> float:
-        """Furthest that the character's rest pose extends from its root between two heights, all in metres."""
-        return horizontal_extent(self.simulation.model, len(self._bodies), low, high)
+        """Furthest that the character extends at first from its root between two heights, all in metres."""
+        return horizontal_extent(self.simulation.model, len(self._bodies), self.beginnings.poses(), low, high)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
-        start = super()._sample(num)
+        start, drawn = super()._sample(num), self.ranges.draw(num, self.generator)
         marks = mocap_positions(self.simulation.model).repeat(num, 1, 1)
-        place = start["qpos"][:, :2] + self._somewhere(num, self.object_distances)
+        directions = drawn["object_directions"], drawn["object_directions"] + drawn["target_directions"]
+        place = start["qpos"][:, :2] + steps(drawn["object_distances"], directions[0])
         start["qpos"][:, -7:-5] = place
-        marks[:, 0, :2] = place + self._somewhere(num, self.target_distances)
+        marks[:, 0, :2] = place + steps(drawn["target_distances"], directions[1])
         return {**start, "mocap_pos": marks}
-
-    def _somewhere(self, num: int, distances: tuple[float, float]) -> Tensor:
-        """Draw steps in any direction, ``(num, 2)``."""
-        distance, angle = torch.rand(2, num, dtype=torch.float64, generator=self.generator)
-        low, high = distances
-        return torch.polar(low + (high - low) * distance, 2 * math.pi * angle).view(torch.float64).view(num, 2)
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "object": self._object[ids]}
 
-    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+    def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:
         bodies = self._body_states(ids)
         root, angle = bodies.positions[:, 0], self.heading(ids).to(self._dtype)
         seen = bodies_in_heading_frame(angle, root, bodies).unflatten(-1, (-1, 13))
@@ -142,7 +153,12 @@ class Transport(PDCharacterEnv):
             "success": self.success()[ids].unsqueeze(-1),
         }
 
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+    def _distances(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        com, thing, target = (part[ids, :2] for part in (self._com, self._object, self._target))
+        ways = {"object": thing - com, "target": target - thing}
+        return {name: torch.linalg.vector_norm(way, dim=-1) for name, way in ways.items()}
+
+    def _task_reward(self) -> Tensor:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
         self.episode["object"].copy_(self._object)
         reward = self._reward(
@@ -154,7 +170,7 @@ class Transport(PDCharacterEnv):
         )
         if self.success_reward:
             reward = reward.masked_fill(self.success(), 1.0)
-        return self._unless_fallen(reward)
+        return reward
 
     def _arrows(self, index: int) -> list[Arrow]:
         """From above the character to the object, and from above the object to the target."""
@@ -177,20 +193,9 @@ def goal_layout(things: Mapping[str, int]) -> dict[str, slice]:
     return layout
 
 
-def distance_range(name: str, value: Sequence[float]) -> tuple[float, float]:
-    """Check that ``value`` is a range of distances, and return it."""
-    low, high = interval(name, value)
-    if low < 0:
-        raise ValueError(f"{name}={value!r} begins below 0: pass two distances (lo, hi) in metres")
-    return low, high
-
-
-def clear_of(name: str, value: tuple[float, float], clearance: float) -> tuple[float, float]:
-    """A range of distances without those below ``clearance``, where bodies would overlap."""
-    low, high = value
-    if high < clearance:
-        raise ValueError(f"{name}={value} ends where bodies overlap: let it end beyond {clearance:.2f}")
-    return max(low, clearance), high
+def steps(distances: Tensor, directions: Tensor) -> Tensor:
+    """Displacements of some length in metres and direction in radians, ``(*B, 2)``."""
+    return torch.stack([directions.cos(), directions.sin()], -1) * distances.unsqueeze(-1)
 
 
 def mocap_positions(model: mujoco.MjModel) -> Tensor:
@@ -198,26 +203,30 @@ def mocap_positions(model: mujoco.MjModel) -> Tensor:
     return torch.from_numpy(model.body_pos[model.body_mocapid >= 0])
 
 
-def horizontal_extent(model: mujoco.MjModel, num_bodies: int, low: float, high: float) -> float:
-    """How far a character's rest pose extends horizontally from its root.
+def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low: float, high: float) -> float:
+    """How far a character extends horizontally from its root.
 
     Args:
         model: The scene, whose first bodies are the character's.
         num_bodies: Number of the character's bodies.
+        poses: Coordinates of the character, ``(P, nq)``.
         low: The lowest height that counts, in metres.
         high: The highest.
 
     Returns:
-        Radius in metres, of the boxes around its shapes.
+        Radius in metres of the boxes around its shapes, the largest of all poses.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    half_sizes = np.einsum("gij,gj->gi", np.abs(data.geom_xmat.reshape(-1, 3, 3)), model.geom_aabb[:, 3:])
-    centres = data.geom_xpos - data.xpos[1] * [1, 1, 0]
-    own = (model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0)
-    own &= (centres[:, 2] - half_sizes[:, 2] < high) & (centres[:, 2] + half_sizes[:, 2] > low)
-    corners = (np.abs(centres) + half_sizes)[own, :2]
-    return float(np.hypot(*corners.T).max(initial=0.0))
+    data, radius = mujoco.MjData(model), 0.0
+    own = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0))
+    for pose in poses.numpy():
+        data.qpos[: len(pose)] = pose
+        mujoco.mj_kinematics(model, data)
+        half_sizes = np.einsum("gij,gj->gi", np.abs(data.geom_xmat[own].reshape(-1, 3, 3)), model.geom_aabb[own, 3:])
+        centres = data.geom_xpos[own] - data.xpos[1] * [1, 1, 0]
+        between = (centres[:, 2] - half_sizes[:, 2] < high) & (centres[:, 2] + half_sizes[:, 2] > low)
+        corners = (np.abs(centres) + half_sizes)[between, :2]
+        radius = max(radius, float(np.hypot(*corners.T).max(initial=0.0)))
+    return radius
 
 
 def pointer(tail: Tensor, tip: Tensor) -> Arrow:

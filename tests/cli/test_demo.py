@@ -85,7 +85,8 @@ def test_pictures_decode_and_are_not_blank(finished, name):
 
 def test_the_last_words_are_the_table_and_where_to_find_it(finished):
     assert (finished.folder / "results.md").read_text().strip() in finished.output
-    assert str(finished.folder) in finished.output.splitlines()[-1]
+    assert str(finished.folder) in finished.output
+    assert "film" in finished.output.splitlines()[-1]
     for name in FILES:
         stem, suffix = name.split(".")
         assert stem in finished.output
@@ -135,3 +136,27 @@ def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, ove
     with pytest.raises(SystemExit, match=override.partition("=")[0]):
         demo.main()
     assert not (tmp_path / "demo").exists()
+
+
+def test_it_says_in_the_beginning_how_long_it_takes(finished):
+    first, *_ = finished.output.splitlines()
+    assert first == f"This takes about 1 minutes on two cores. Everything lands in {finished.folder}."
+
+
+def test_the_ant_is_filmed_once(finished, monkeypatch):
+    pictures = []
+    monkeypatch.setattr(demo, "save_film", lambda policy, env, path, seconds: pictures.append(path.touch()))
+    (finished.folder / demo.FILM).unlink(missing_ok=True)
+    lines = [demo.film(finished.folder, 1.0) for _ in range(2)]
+    assert len(pictures) == 1
+    assert lines[0] == lines[1]
+    assert "film.gif" in lines[0]
+
+
+def test_where_nothing_can_be_drawn_the_demonstration_says_so_and_ends_well(finished, monkeypatch):
+    def refuse(*arguments, **settings):
+        raise RuntimeError("no OpenGL")
+
+    monkeypatch.setattr(demo, "save_film", refuse)
+    (finished.folder / demo.FILM).unlink(missing_ok=True)
+    assert demo.film(finished.folder, 1.0) == "  no film: no OpenGL"

@@ -180,9 +180,10 @@ def over_the_target(env, clearance, shift=0.0):
     return state
 
 
-def test_the_joint_opens_once_the_box_stands_on_the_target():
+@pytest.mark.parametrize("clearance", [0.005, 0.05])
+def test_the_joint_opens_over_the_target_and_the_box_then_stands_there(clearance):
     env = make()
-    carrier = env.reset(over_the_target(env, 0.005), set_state=True)
+    carrier = env.reset(over_the_target(env, clearance), set_state=True)
     carrier = play(env, carrier, 1)
     assert joined(env) == [0.0, 0.0]
     play(env, carrier, 20)
@@ -191,11 +192,47 @@ def test_the_joint_opens_once_the_box_stands_on_the_target():
     assert np.abs(data.body("box").cvel).max() < 1e-2
 
 
-@pytest.mark.parametrize(("clearance", "shift"), [(0.03, 0.0), (0.005, 0.145)])
+@pytest.mark.parametrize(("clearance", "shift"), [(0.08, 0.0), (0.005, 0.145)])
 def test_the_joint_stays_closed_above_the_target_and_beside_it(clearance, shift):
     env = make()
     play(env, env.reset(over_the_target(env, clearance, shift), set_state=True), 3)
     assert joined(env) == [1.0, 1.0]
+
+
+def test_success_is_a_box_that_was_taken_and_put_down_on_the_target():
+    env = make(3)
+    state = over_the_target(env, 0.0)
+    state["eq_active"][1:] = 0
+    state["taken"][2] = 0
+    state["qpos"][:, 0] -= 1  # away from the box, which stands on the target: held, put down, and never taken
+    carrier = env.reset(state, set_state=True)
+    assert carrier["success"].flatten().tolist() == [False, True, False]
+    beside = state.clone()
+    beside["mocap_pos"][:, 0, 0] += 0.3
+    assert not env.reset(beside, set_state=True)["success"].any()
+    above = state.clone()
+    above["mocap_pos"][:, 0, 2] -= 0.03
+    assert not env.reset(above, set_state=True)["success"].any()
+
+
+def test_no_episode_begins_with_a_success():
+    env = make(500, object_distances=(0.5, 1.0), target_distances=(0.0, 0.5))
+    assert not env.reset()["success"].any()
+
+
+def test_tables_hold_the_box_and_touch_no_character():
+    model = make(1, "humanoid", self_collision=True).simulation.model
+    tops = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name in ("source", "target")]
+    box = model.geom("box").id
+    for top in tops:
+        meets = [
+            geom
+            for geom in range(model.ngeom)
+            if model.geom_contype[geom] & model.geom_conaffinity[top]
+            or model.geom_contype[top] & model.geom_conaffinity[geom]
+        ]
+        assert meets in ([box], [])  # a top, a leg
+    assert sum(bool(model.geom_contype[top]) for top in tops) == 2
 
 
 def test_a_box_that_was_put_down_is_not_taken_again_in_the_same_episode():
@@ -275,13 +312,13 @@ def test_the_box_waits_on_the_source_as_it_is_turned():
     assert joined(env) == [0.0] * 8
 
 
-def test_no_target_stands_in_the_character_and_none_further_than_asked():
+def test_no_box_begins_in_the_character_and_no_table_in_the_other():
     env = make(2000, object_distances=(0.0, 1.0), target_distances=(0.0, 1.5))
     env.reset()
     target, source = env.simulation.state["mocap_pos"][:, :, :2].unbind(1)
     corner = math.hypot(HALF_SIZE, HALF_SIZE)
     arms_length = math.hypot(FRONT, 0.145)  # a corner of the torso
-    assert target.norm(dim=-1).min() >= arms_length + corner - 1e-9
+    assert source.norm(dim=-1).min() >= arms_length + corner - 1e-9
     distances = (target - source).norm(dim=-1)
     assert distances.min() >= 2 * corner
     assert distances.max() <= 1.5

@@ -219,14 +219,24 @@ def test_velocities_in_the_reward_are_displacements_over_the_step(task):
     assert reward == pytest.approx(expected, rel=1e-9)
 
 
-@every_task
-@pytest.mark.parametrize("success_reward", [False, True])
-def test_success_is_an_object_within_half_a_metre_of_the_target_and_may_be_worth_one(task, success_reward):
-    env = make(task, num_envs=2, object_distances=(1.0, 1.0), success_reward=success_reward)
+def near_success(env):
+    """A state of two simulations, of which the first is a success and the second is not by some centimetres."""
     env.reset()
     state = env.get_state()
-    away = torch.tensor([[0.0, 0.47], [0.0, 0.53]])
-    state["mocap_pos"][:, 0, :2] = state["qpos"][:, -7:-5] + away
+    away = {Dribble: [[0.0, 0.47], [0.0, 0.53]], Carry: [[0.0, 0.1], [0.0, 0.15]]}[type(env)]
+    state["mocap_pos"][:, 0, :2] = state["qpos"][:, -7:-5] + torch.tensor(away)
+    if "taken" in state:  # a box that was put down on the target
+        state["taken"].fill_(1)
+        state["mocap_pos"][:, 0, 2], state["mocap_pos"][:, 1, 0] = state["mocap_pos"][:, 1, 2], 9.0
+        state["mocap_quat"][:, 0] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    return state
+
+
+@every_task
+@pytest.mark.parametrize("success_reward", [False, True])
+def test_success_has_a_limit_and_may_be_worth_one(task, success_reward):
+    env = make(task, num_envs=2, object_distances=(1.0, 1.0), success_reward=success_reward)
+    state = near_success(env)
     carrier = env.reset(state, set_state=True)
     assert carrier["success"].flatten().tolist() == [True, False]
     outcome = env.step(carrier.set("action", torch.zeros(2, 17)))["next"]
@@ -236,14 +246,13 @@ def test_success_is_an_object_within_half_a_metre_of_the_target_and_may_be_worth
 
 @every_task
 def test_a_fallen_character_earns_nothing_from_success(task):
-    env = make(task, num_envs=1, success_reward=True, object_distances=(1.0, 1.0), target_distances=(0.43, 0.45))
-    env.reset()
-    state = env.get_state()
+    env = make(task, num_envs=2, success_reward=True, object_distances=(1.0, 1.0))
+    state = near_success(env)
     state["qpos"][:, 2], state["qpos"][:, 3:7] = 0.05, torch.tensor([math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0])
-    outcome = env.step(env.reset(state, set_state=True).set("action", torch.zeros(1, 17)))["next"]
-    assert outcome["success"].all()
+    outcome = env.step(env.reset(state, set_state=True).set("action", torch.zeros(2, 17)))["next"]
+    assert outcome["success"][0]
     assert outcome["terminated"].all()
-    assert outcome["reward"] == 0
+    assert (outcome["reward"] == 0).all()
 
 
 @every_task

@@ -140,6 +140,26 @@ def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_r
     ]
 
 
+def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
+    evaluated = {"speed": 1.0, "initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "shaping": {}}
+    trained = {**evaluated, "speed": 1.0, "initial_states": {"rest": 0.2, "motions": 0.8}, "mixture": [{"weight": 2}]}
+    trained["shaping"] = {"object": {"slope": 1.0}}
+    runs = {"plain": evaluated, "practised": trained}
+    plain, practised = grouped(
+        *(
+            write_run(name, practice__name=name, task__transfer=use, task__evaluation=evaluated)
+            for name, use in runs.items()
+        )
+    )
+    assert [cell.settings for cell in (plain, practised)] == [{"practice": "plain"}, {"practice": "practised"}]
+    assert not any(remark.startswith("trained with") for remark in plain.remarks)
+    (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
+    assert remark == (
+        "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, "
+        "mixture=[{'weight': 2}], shaping.object.slope=1.0"
+    )
+
+
 def test_caveats_tell_what_differs_between_cells(write_run, write_mcp):
     found = grouped(
         write_run("a", commit="aaa"),
@@ -195,6 +215,7 @@ def test_methods_have_colours_of_their_own_those_of_table_2_first(write_run):
         ("num_primitives", "num_primitives", [4, 8, 16]),
         ("mixer", "mixer__name", ["additive", "multiplicative"]),
         ("exploration", "exploration__name", ["action", "weights"]),
+        ("practice", "practice__name", ["printed", "shaping"]),
     ],
 )
 def test_an_ablation_holds_the_cells_that_differ_in_its_setting_alone(write_mcp, write_run, setting, key, values):

@@ -68,8 +68,8 @@ def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run
     for mode in ("deterministic", "stochastic"):
         assert numbers[mode]["episodes"] == 100
         assert f"normalised return {numbers[mode]['normalised_return']:.3f}" in outcome.stdout
-        # Holdout normalises by 6 per step, here over 100 steps.
-        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / 600, rel=1e-4)
+        # Holdout normalises by 6 per step, evaluated over 200 steps, though this run was trained on 100.
+        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / (6 * 200), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -227,28 +227,15 @@ def test_a_benchmark_does_not_touch_runs_of_another_version(evaluated, tmp_path)
         benchmark.conflict(job)
 
 
-def test_a_run_of_before_methods_told_about_themselves_is_completed_with_its_own_networks(tmp_path):
-    cfg = configure("method=mcp", "num_primitives=4", "gating=softmax")
-    expected = OmegaConf.to_container(cfg, resolve=True)["method"]
-    del cfg.method
-    cfg.method = {"name": "mcp"}
-    OmegaConf.save(cfg, tmp_path / "config.yaml", resolve=True)
-    found = OmegaConf.to_container(experiment.configuration(tmp_path), resolve=True)["method"]
-    assert (found["title"], found["standard"], found["explorer"]) == tuple(
-        expected[key] for key in ("title", "standard", "explorer")
-    )
-    assert found["explorer"]["num_primitives"] == 4
-    assert found["explorer"]["gate_activation"]["_target_"] == "torch.nn.Softmax"
-
-
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():
+    found = {}
     for method in ("mcp", "finetune", "hierarchical"):
-        evaluation = configure("task=imitation", "character=biped", f"method={method}", "preset=fast").evaluation
-        assert OmegaConf.to_container(evaluation, resolve=True) == {
-            "episodes": 128,
-            "seed": 12345,
-            "environment": {"clip_end": "switch", "switch_interval": 5.0},
-        }
+        evaluation = configure("task=imitation", f"method={method}", "preset=fast").evaluation
+        assert (evaluation.episodes, evaluation.seed) == (128, 12345)
+        found[method] = OmegaConf.to_container(evaluation.environment, resolve=True)
+    assert (found["mcp"]["clip_end"], found["mcp"]["switch_interval"]) == ("switch", 5.0)
+    for method in ("finetune", "hierarchical"):  # of policies that cannot see what they follow
+        assert found[method] == {**found["mcp"], "switch_to": "same"}
 
 
 @pytest.mark.parametrize(("method", "stage", "step_size"), [("mcp", "pretrain", 2e-5), ("mcp", "transfer", 5e-5)])
@@ -270,4 +257,4 @@ def test_the_paper_preset_holds_table_5(method, stage, step_size):
 def test_every_configuration_file_is_short_and_says_what_it_is(path):
     lines = path.read_text().splitlines()
     assert any(line.startswith("# ") and not line.startswith("# @package") for line in lines[:2])
-    assert path.name == "train.yaml" or len(lines) <= 20
+    assert path.name == "train.yaml" or len(lines) <= {"method": 30, "task": 40}.get(path.parent.name, 20)

@@ -21,7 +21,9 @@ def test_every_level_of_a_run_folder_is_in_its_path():
         assert f"${{{setting}" in TRAIN["run_dir"].replace(".name", "")
 
 
-@pytest.mark.parametrize("settings", [UNNAMED, UNLEARNT - {"task.evaluation"}], ids=["unnamed", "unlearnt"])
+@pytest.mark.parametrize(
+    "settings", [UNNAMED, UNLEARNT - {"task.evaluation", "task.practice"}], ids=["unnamed", "unlearnt"]
+)
 def test_every_setting_that_is_named_exists(settings):
     for name in settings:
         first, _, rest = name.partition(".")

@@ -27,6 +27,7 @@ from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.checkpoint import FOLDER
 from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
+from torchrl_mcp.viewer.film import save_film
 
 Runs = Mapping[str, DictConfig]
 
@@ -44,6 +45,7 @@ PANELS = {
 }
 SPACING = math.radians(15)
 
+FILM = "film.gif"
 CONTENTS = """\
   results.md, results.json           the table, and all its numbers
   learning_curves.png, .svg, .csv    learning on the held-out directions
@@ -94,11 +96,26 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
     runs["transfer"].pretrained = runs["pretrain"].run_dir
     require_early_checkpoint(runs)
-    print(f"Working in {folder}. Interrupt it when you like: called again, it goes on from there.", flush=True)
+    settings = runs["pretrain"].demo
+    print(f"This takes about {settings.minutes} minutes on two cores. Everything lands in {folder}.")
+    print("Interrupt it when you like: called again, it goes on from there.", flush=True)
     show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
     print("\n" + report(folder, runs))
+    filmed = film(folder, settings.film.seconds)
     print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes everything is in {folder}:")
-    print(CONTENTS.format(folder=folder))
+    print(f"{CONTENTS.format(folder=folder)}\n{filmed}")
+
+
+def film(folder: Path, seconds: float) -> str:
+    """Film the ant after transfer, unless there is a film, and return what the contents say of it."""
+    path = folder / FILM
+    _, agent, env = experiment.restore(folder / "transfer", num_envs=1, seed=0)
+    try:
+        if not path.exists():
+            save_film(agent.actor.policy, env, path, seconds=seconds)
+    except RuntimeError as error:
+        return f"  no film: {error}"
+    return f"  {FILM:35}the ant runs in held-out directions"
 
 
 def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:

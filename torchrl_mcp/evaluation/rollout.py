@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_mcp.envs.transfer import task_reward
 from torchrl_mcp.evaluation.statistics import mean
 
 
@@ -18,7 +19,7 @@ class Evaluation:
     """The outcome of one episode per environment.
 
     Attributes:
-        returns: Undiscounted sum of rewards of each episode, ``(N,)``.
+        returns: Undiscounted sum of rewards of each episode, without shaping, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
@@ -77,7 +78,7 @@ def evaluate(
             decisions.append(decision.select(*record)[running.to(device)])
             step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))
             outcome = step["next"]
-            returns += outcome["reward"].squeeze(-1) * running
+            returns += task_reward(outcome).squeeze(-1) * running
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
             for key, raised in flags.items():

@@ -112,6 +112,19 @@ class Run:
         return self.provenance.get("commit") or "unknown"
 
     @property
+    def practice(self) -> list[str]:
+        """Settings of the environment in transfer that are not those of the evaluation: a line, or none."""
+        if self.stage != "transfer":
+            return []
+        trained, evaluated = (
+            {name.removeprefix(prefix): value for name, value in self.settings.items() if name.startswith(prefix)}
+            for prefix in ("task.transfer.", "task.evaluation.")
+        )
+        shared = (name for name in trained if name in evaluated or name.startswith("shaping."))
+        different = [f"{name}={trained[name]}" for name in shared if trained[name] != evaluated.get(name)]
+        return [", ".join(different)] if different else []
+
+    @property
     def progress(self) -> float:
         """Share of its steps that it has taken, at most 1."""
         return min(1.0, self.frames / self.total_frames)

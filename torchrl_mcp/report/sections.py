@@ -26,6 +26,10 @@ ABLATIONS = {
     "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper, where both fare alike on most tasks."),
     "mixer": ("Mixer", "Primitives composed by Eq. 2, multiplicative, or by Eq. 1, additive."),
     "exploration": ("Exploration", "Over actions, as in Eq. 4, or over the weights of primitives, as in Section 5.3."),
+    "practice": (
+        "Practice",
+        "What training used beside the episodes that the paper prints; the evaluation is the same.",
+    ),
 }
 
 SETTING_WORDS = {
@@ -37,6 +41,7 @@ SETTING_WORDS = {
     "trained": "trained: {}",
     "mixer": "{} mixer",
     "exploration": "exploration: {}",
+    "practice": "practice: {}",
     "pretrained": "{} pre-training",
 }
 

@@ -23,14 +23,16 @@ LEVELS = ("task", "character", "stage", "method", "seed")
 UNNAMED = CONDUCT | PLACES | {*LEVELS, "autocast", "evaluation.episodes", "evaluation.seed"}
 """Settings that the name of a run folder leaves out: ``exclude_keys`` of ``conf/train.yaml``."""
 
-ENVIRONMENTS = frozenset({"benchmark", "evaluation", "imitation", "motions", "task.evaluation"})
+ENVIRONMENTS = frozenset(
+    {"benchmark", "evaluation", "imitation", "motions", "practice", "task.evaluation", "task.practice"}
+)
 """What configures no training, or environments that only some stages have: what a stage has of them is in ``task``."""
 
 UNLEARNT = CONDUCT | PLACES | ENVIRONMENTS | {"autocast", "seed"}
 """Settings that tell no runs apart where results are compared: runs that differ in them alone are averaged."""
 
 TRANSFER_ONLY = frozenset(
-    {"budget.scratch", "budget.transfer", "exploration", "pretrained", "transfer.freeze", "transfer.keep"}
+    {"budget.scratch", "budget.transfer", "exploration", "practice", "pretrained", "transfer.freeze", "transfer.keep"}
 )
 """Settings that make no difference to pre-training, or that it refuses."""
 

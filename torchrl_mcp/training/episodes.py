@@ -4,9 +4,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_mcp.envs.transfer import task_reward
+
 
 class EpisodeStatistics:
-    """Returns and lengths of episodes that span several batches.
+    """Returns and lengths of episodes that span several batches: the task's own rewards, without shaping.
 
     Args:
         num_envs: Number of environments, ``N``.
@@ -19,7 +21,7 @@ class EpisodeStatistics:
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Add trajectories ``(N, T)``; give return and length of each of the ``E`` episodes that ended, ``(E,)``."""
         ended_returns, ended_lengths = [], []
-        rewards, dones = batch["next", "reward"].squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
+        rewards, dones = task_reward(batch["next"]).squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
             self.returns += reward
             self.lengths += 1

@@ -1,0 +1,83 @@
+"""States in which episodes begin: at rest, or in the middle of a motion."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.corpus import generated_library
+from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.motions.library import MotionLibrary
+from torchrl_mcp.envs.motions.placement import placing
+
+KINDS = ("rest", "motions")
+"""Of states: a character that stands still in its rest pose, and one at a random moment of a random motion."""
+
+
+class Beginnings:
+    """Draws states in which episodes begin, each with its root over the origin and facing along x.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        initial_states: ``"rest"``, ``"motions"``, or a weight for each: relative to their sum, how often it is drawn.
+        motions: Library of motions, or clips by name; None for the character's generated motions, which are made only
+            if they are drawn from.
+
+    Raises:
+        ValueError: If the kinds of states or their weights are none, or the motions are of another character.
+    """
+
+    def __init__(
+        self,
+        character: str,
+        initial_states: str | Mapping[str, float] = "rest",
+        motions: MotionLibrary | Mapping[str, MotionClip] | None = None,
+    ) -> None:
+        weights = {initial_states: 1.0} if isinstance(initial_states, str) else dict(initial_states)
+        total = sum(weights.values())
+        if not set(weights) <= set(KINDS) or min(weights.values(), default=-1) < 0 or not 0 < total < float("inf"):
+            raise ValueError(
+                f"initial_states={initial_states!r} is unknown: pass rest, motions, or a weight of at least 0 for each"
+            )
+        model = character_model(character)
+        self.rest, self.num_velocities = torch.from_numpy(model.qpos0), model.nv
+        self.in_motion = weights.get("motions", 0.0) / total
+        self.library = self._library(character, motions) if self.in_motion else None
+
+    def draw(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw states of the character: ``qpos``, shape ``(num, nq)``, and ``qvel``, ``(num, nv)``."""
+        qpos = self.rest.repeat(num, 1)
+        qvel = torch.zeros(num, self.num_velocities, dtype=torch.float64)
+        if self.library is None or not num:
+            return qpos, qvel
+        moving = (torch.rand(num, generator=generator) < self.in_motion).nonzero().squeeze(-1)
+        clips, times = self.library.sample(num, generator)
+        moment = self.library.at(clips, times)
+        placement = placing(moment.qpos, qpos)
+        qpos[moving] = placement.qpos(moment.qpos)[moving].double()
+        qvel[moving] = placement.qvel(moment.qvel)[moving].double()
+        return qpos, qvel
+
+    def poses(self, interval: float = 0.1) -> Tensor:
+        """Poses that can be drawn, ``(P, nq)``: the rest pose, and motions every ``interval`` seconds."""
+        if self.library is None:
+            return self.rest.unsqueeze(0)
+        moments = [
+            (clip, time)
+            for clip, duration in enumerate(self.library.durations.tolist())
+            for time in torch.arange(0.0, duration, interval, dtype=torch.float64).tolist()
+        ]
+        clips, times = zip(*moments, strict=True)
+        poses = self.library.at(torch.tensor(clips), torch.tensor(times, dtype=torch.float64)).qpos.double()
+        rest = self.rest.expand(len(poses), -1)
+        return torch.cat([self.rest.unsqueeze(0), placing(poses, rest).qpos(poses)])
+
+    @staticmethod
+    def _library(character: str, motions: MotionLibrary | Mapping[str, MotionClip] | None) -> MotionLibrary:
+        if motions is None:
+            return generated_library(character, seed=0)
+        library = motions if isinstance(motions, MotionLibrary) else MotionLibrary(motions)
+        if library.character != character:
+            raise ValueError(f"motions are of {library.character}: pass motions of character={character!r}")
+        return library

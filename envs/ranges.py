@@ -1,0 +1,78 @@
+"""What a task draws evenly for each episode, and mixtures of ranges to draw from."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.arguments import interval
+
+
+class Ranges:
+    """Intervals by name, from which a number each is drawn for an episode, and weighted alternatives to them.
+
+    Args:
+        ranges: Interval (lo, hi) by name.
+        mixture: Alternatives. Each names intervals of its own, which replace those of ``ranges``, and its ``weight``, 1
+            if it names none: relative to the sum of weights, the share of episodes that draw from it. Empty for
+            ``ranges`` alone.
+
+    Raises:
+        ValueError: If something is no interval, of a name that ``ranges`` has not, or no weight.
+
+    Example:
+        >>> near = {"weight": 3, "distances": (0.0, 1.0)}
+        >>> ranges = Ranges({"distances": (1.0, 9.0)}, [near, {}])
+        >>> distances = ranges.draw(1000, torch.Generator().manual_seed(0))["distances"]
+        >>> 700 < (distances < 1).sum() < 800
+        tensor(True)
+    """
+
+    def __init__(self, ranges: Mapping[str, Sequence[float]], mixture: Sequence[Mapping[str, Any]] = ()) -> None:
+        alternatives = [dict(alternative) for alternative in mixture] or [{}]
+        weights = [alternative.pop("weight", 1.0) for alternative in alternatives]
+        if unknown := {name for alternative in alternatives for name in alternative} - set(ranges):
+            raise ValueError(f"mixture names {sorted(unknown)}: pass weight and ranges of {list(ranges)}")
+        if not all(0 < weight < float("inf") for weight in weights):
+            raise ValueError(f"mixture has weights {weights}: pass finite numbers above 0")
+        self._names = list(ranges)
+        complete = [{**ranges, **alternative} for alternative in alternatives]
+        pairs = [[interval(name, value) for name, value in alternative.items()] for alternative in complete]
+        self._bounds = torch.tensor(pairs, dtype=torch.float64)  # (alternatives, names, 2)
+        self._weights = torch.tensor(weights, dtype=torch.float64)
+
+    def draw(self, num: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw for ``num`` episodes: by name, ``(num,)``, float64."""
+        draws = max(num, 1)  # multinomial draws no empty sample
+        chosen = torch.multinomial(self._weights, draws, replacement=True, generator=generator)[:num]
+        low, high = self._bounds[chosen].unbind(-1)
+        drawn = low + (high - low) * torch.rand(low.shape, dtype=torch.float64, generator=generator)
+        return dict(zip(self._names, drawn.unbind(-1), strict=True))
+
+    def require_distances(self, *names: str) -> None:
+        """Check that ranges are of distances, which are not negative.
+
+        Raises:
+            ValueError: If one begins below 0.
+        """
+        for name in names:
+            for low, high in self._of(name).tolist():
+                if low < 0:
+                    raise ValueError(f"{name}={(low, high)} begins below 0: pass two distances (lo, hi) in metres")
+
+    def keep_clear(self, name: str, clearance: float) -> None:
+        """Leave out distances below ``clearance`` metres, where bodies would overlap.
+
+        Raises:
+            ValueError: If a range has no others.
+        """
+        bounds = self._of(name)
+        for low, high in bounds.tolist():
+            if high < clearance:
+                raise ValueError(f"{name}={(low, high)} ends where bodies overlap: let it end beyond {clearance:.2f}")
+        bounds[:, 0].clamp_(min=clearance)
+
+    def _of(self, name: str) -> Tensor:
+        """Bounds of a name in all alternatives, ``(M, 2)``, a live view."""
+        return self._bounds[:, self._names.index(name)]

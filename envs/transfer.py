@@ -1,0 +1,130 @@
+"""What tasks for pre-trained characters share: where their episodes begin, and shaping of their reward."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.base import ALL
+from torchrl_mcp.envs.beginnings import Beginnings
+from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.library import MotionLibrary
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.ranges import Ranges
+from torchrl_mcp.envs.shaping import Ramp, potential, shaping_reward
+
+TASK_REWARD = "task_reward"
+"""Key under which environments with shaping show the reward without it."""
+
+
+def task_reward(outcome: TensorDictBase) -> Tensor:
+    """The task's own reward of steps, whether or not training shapes what it learns from, ``(*B, 1)``.
+
+    Args:
+        outcome: What an environment says after its steps, batch size ``(*B,)``.
+    """
+    return outcome.get(TASK_REWARD, outcome["reward"])
+
+
+class TransferTask(PDCharacterEnv):
+    """A task for characters that can walk, and what training on it may use: by default nothing of it.
+
+    Episodes may begin in motion, and in easier places than those of the task. Shaping adds rewards for progress, and
+    ``task_reward`` (1) then shows the task's own reward of the step beside the ``reward`` that is learnt from.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        ranges: What the task draws evenly for each episode, intervals by name.
+        mixture: Alternatives to ``ranges``, see :class:`~torchrl_mcp.envs.ranges.Ranges`.
+        initial_states: ``"rest"``, ``"motions"`` or a weight for each, see
+            :class:`~torchrl_mcp.envs.beginnings.Beginnings`.
+        motions: To begin in, None for the generated ones.
+        shaping: ``slope`` and ``reach`` of the :func:`~torchrl_mcp.envs.shaping.potential` by the names of the task's
+            distances; none for no shaping. A fallen character has no potential.
+        discount: Of the learner, for shaping.
+        episode: What the task remembers of one simulation at first.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+
+    distances: tuple[str, ...] = ()
+    """Names of the distances that the task shortens, of which shaping can be made."""
+
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        ranges: Mapping[str, Sequence[float]],
+        mixture: Sequence[Mapping[str, Any]] = (),
+        initial_states: str | Mapping[str, float] = "rest",
+        motions: MotionLibrary | Mapping[str, MotionClip] | None = None,
+        shaping: Mapping[str, Mapping[str, float]] | None = None,
+        discount: float = 0.99,
+        episode: Mapping[str, Tensor],
+        **kwargs: Any,
+    ) -> None:
+        self.ranges = Ranges(ranges, mixture)
+        ramps = {name: Ramp(**ramp) for name, ramp in (shaping or {}).items()}
+        if unknown := set(ramps) - set(self.distances):
+            raise ValueError(f"shaping names {sorted(unknown)}: pass slope and reach of {list(self.distances)}")
+        for name, ramp in ramps.items():
+            not_negative(**{f"shaping.{name}.{part}": value for part, value in ramp._asdict().items()})
+        if not 0 < discount <= 1:
+            raise ValueError(f"discount={discount} is out of range: pass the learner's, above 0 and at most 1")
+        self.shaping, self.discount = ramps, discount
+        zero = torch.zeros((), dtype=torch.float64)
+        remembered = {"potential": zero, TASK_REWARD: zero} if self.shaping else {}
+        super().__init__(character, num_envs, episode={**remembered, **episode}, **kwargs)
+        self.beginnings = Beginnings(character, initial_states, motions)
+
+    def _sample(self, num: int) -> dict[str, Tensor]:
+        start = super()._sample(num)
+        qpos, qvel = self.beginnings.draw(num, self.generator)
+        start["qpos"][:, : qpos.shape[1]], start["qvel"][:, : qvel.shape[1]] = qpos, qvel
+        return start
+
+    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
+        begun = super()._begin(ids)
+        if self.shaping:
+            begun |= {"potential": self._potential(ids), TASK_REWARD: torch.zeros(len(ids))}
+        return begun
+
+    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        observed = self._show(ids)
+        if self.shaping:
+            observed[TASK_REWARD] = self.episode[TASK_REWARD][ids].unsqueeze(-1)
+        return observed
+
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+        reward, terminated = self._unless_fallen(self._task_reward())
+        if self.shaping:
+            self.episode[TASK_REWARD].copy_(reward)[diverged] = 0.0
+            before = self.episode["potential"].clone()
+            after = self.episode["potential"].copy_(self._potential(ALL))
+            reward = reward + shaping_reward(before, after, self.discount)
+        return reward, terminated
+
+    def _potential(self, ids: Tensor | slice) -> Tensor:
+        """Potential of simulations, ``(n,)``: 0 after a fall."""
+        standing = potential(self._distances(ids), self.shaping)
+        return standing.masked_fill(self.fallen()[ids], 0.0)
+
+    def _distances(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """The distances that the task shortens, by name, each ``(n,)`` in metres."""
+        return {}
+
+    @abstractmethod
+    def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """See :meth:`CharacterEnv._observe`."""
+
+    @abstractmethod
+    def _task_reward(self) -> Tensor:
+        """Reward of the step just made, unless the character has fallen, ``(N,)``, float64; updates ``episode``."""

@@ -1,0 +1,147 @@
+"""Evaluations are alike, whatever was used in training."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from torchrl_mcp.evaluation.rollout import evaluate
+from torchrl_mcp.runs import build
+
+STAGES = {
+    "holdout": "pretrain",
+    "imitation": "pretrain",
+    "heading": "transfer",
+    "carry": "transfer",
+    "dribble": "transfer",
+}
+NO_SETTINGS = {
+    "self",
+    "character",
+    "num_envs",
+    "clips",
+    "motions",
+    "seed",
+    "num_threads",
+    "dtype",
+    "pin_memory",
+    "kwargs",
+}
+"""Arguments that every maker of an environment gives, or that say what is in it and not what happens."""
+RUNS_OWN = {"imitation": {"terms", "switch_to"}}
+"""What an evaluation takes from training, as its file says: the reward, and what blind policies can follow."""
+OTHER = {
+    "initial_states": {"rest": 0.0, "motions": 1.0},
+    "initial_directions": [1.0, 2.0],
+    "directions": [1.0, 2.0],
+    "object_distances": [1.0, 2.0],
+    "object_directions": [0.5, 0.6],
+    "target_distances": [1.0, 2.0],
+    "target_directions": [0.5, 0.6],
+    "mixture": [{"weight": 2.0}],
+    "shaping": {"object": {"slope": 1.0, "reach": 4.0}},
+    "discount": 0.5,
+    "max_turn": 0.5,
+    "speed": 2.0,
+    "target_distance_power": 1,
+    "success_reward": True,
+    "max_episode_steps": 7,
+    "terminate_on_fall": False,
+    "self_collision": True,
+    "physics_timestep": 1 / 240,
+    "contact_forces": True,
+    "forward_weight": 2.0,
+    "healthy_weight": 2.0,
+    "control_weight": 2.0,
+    "contact_weight": 2.0,
+    "healthy_z_range": [0.3, 0.9],
+    "terminate_when_unhealthy": False,
+    "reset_noise_scale": 0.2,
+    "switch_interval": 1.0,
+    "switch_candidates": 2,
+    "clip_end": "truncate",
+    "failure_weighting": 0.5,
+    "max_error": 0.1,
+}
+"""Another value of every setting than that of the evaluation."""
+every_task = pytest.mark.parametrize("task", STAGES)
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
+
+
+def configure(task, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", [f"task={task}", f"stage={STAGES[task]}", "num_threads=1", *overrides])
+
+
+def evaluated_as(cfg):
+    """Arguments of the evaluation's environment."""
+    return OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
+
+
+def trained_otherwise(task):
+    """A configuration in which every setting of the training's environment has another value."""
+    cfg, place = configure(task), "imitation" if task == "imitation" else f"task.{STAGES[task]}"
+    for name in evaluated_as(cfg).keys() - RUNS_OWN.get(task, set()):
+        if name != "shaping" or task != "heading":  # which has no distance to shape
+            OmegaConf.update(cfg, f"{place}.{name}", OTHER[name], merge=False, force_add=True)
+    return cfg
+
+
+@every_task
+def test_an_evaluation_says_every_setting_of_its_environment(task):
+    cfg = configure(task)
+    arguments = build.arguments(cfg.task[STAGES[task]]._target_)
+    inside = {"things", "furnish", "reward", "ranges", "episode", "model", "substeps", "outputs", "model_fields"}
+    settings = arguments.keys() - NO_SETTINGS - inside - {"persistent", "current"}
+    assert evaluated_as(cfg).keys() == settings
+
+
+@every_task
+def test_evaluations_are_equal_whatever_was_used_in_training(task):
+    usual, other = configure(task), trained_otherwise(task)
+    assert evaluated_as(usual) == evaluated_as(other)
+    outcomes = []
+    for cfg in (usual, other):
+        env = build.make_env(cfg, num_envs=3, seed=0, **{**evaluated_as(cfg), "max_episode_steps": 20})
+        outcomes.append(evaluate(Push(env), env))
+    one, two = outcomes
+    for name in ("returns", "lengths", "terminated", "positions"):
+        assert torch.equal(getattr(one, name).nan_to_num(-9), getattr(two, name).nan_to_num(-9)), name
+    assert one.metrics.keys() == two.metrics.keys()
+    for name, values in one.metrics.items():
+        assert torch.equal(values, two.metrics[name]), name
+
+
+@every_task
+def test_what_training_uses_would_make_another_evaluation(task):
+    cfg = trained_otherwise(task)
+    trained = OmegaConf.to_container(cfg.task[STAGES[task]], resolve=True)
+    for name, value in evaluated_as(cfg).items():
+        if name not in RUNS_OWN.get(task, set()) and (name != "shaping" or task != "heading"):
+            assert trained[name] != value, name
+
+
+@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping"])
+@pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
+def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):
+    cfg = configure(task, f"practice={practice}")
+    assert evaluated_as(cfg) == evaluated_as(configure(task))
+    env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
+    shaped = practice == "shaping" and task != "heading"
+    assert ("task_reward" in env.rollout(2)["next"]) == shaped
+
+
+class Push(torch.nn.Module):
+    """A policy that gives the same action at all times."""
+
+    def __init__(self, env):
+        super().__init__()
+        self.action = torch.full(env.action_spec.shape, 0.1)
+        self.in_keys = ["observation"]
+
+    def forward(self, seen):
+        return seen.set("action", self.action)
