@@ -1,20 +1,22 @@
 """How training scales: measured here with environments, threads and workers, predicted for other machines.
 
-    python benchmarks/scaling.py            # minutes, writes results/scaling.csv and results/scaling_model.csv
+    python benchmarks/scaling.py            # minutes, writes results/scaling*.csv
     python benchmarks/scaling.py --quick    # a minute, writes nothing unless given --output
+    python benchmarks/scaling.py --refit    # seconds, from the measurements that are there
 
 Measured are whole iterations of MCP on the humanoid's heading task with the primitives that come with the library, in
 the precision that ``autocast=auto`` takes. From the seconds of their sections the model's constants are fitted:
 
     iteration = T * (physics * N / speed-up + forward + forward' * N + rest + rest' * N) + update * N * T / speed-up
 
-with ``N`` environments and ``T`` steps of each. Forward pass and rest keep to one thread. Speed-ups follow Amdahl's law
-with the serial share that one and two threads show here. A GPU takes over forward pass and update: its time is that of
-starting its operations, which are counted here, or of their arithmetic, whichever is longer, plus the transfers. What
-is assumed of it is in ``GPU``.
+with ``N`` environments and ``T`` steps of each. Forward pass and rest keep to one thread. How far more cores speed up
+the others is predicted twice from what the second thread brought here: by Amdahl's law (low), and as if every further
+core brought as much (high). A GPU takes over forward pass and update: its time is that of starting its operations,
+which are counted here, or of their arithmetic, whichever is longer, plus the transfers. ``GPU`` is what is assumed.
 """
 
 import argparse
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 2, 512
 SECTIONS = ("physics", "forward", "collection", "update", "other")
 GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
 """Assumed: starts of operations from Python, arithmetic in practice, and a small transfer. The last is waited for."""
+MEASURED = ("num_envs", "threads", "workers", "samples_per_second", *(f"{name}_seconds" for name in SECTIONS))
 TRANSFERS = 5
 """Transfers of a control step, as tests/accelerator counts them for this task."""
 MACHINES = {"2 cores": (2, False), "8 cores": (8, False), "64 cores": (64, False), "8 cores, GPU": (8, True),
@@ -129,7 +132,7 @@ def count() -> dict[str, float]:
 
 
 def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the model's constants: seconds per control step and sample on one thread, and serial shares."""
+    """Return the model's constants: seconds per control step and sample on one thread, and the gain of a second."""
     one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
     constants: dict[str, float] = {}
     for name in ("forward", "other"):
@@ -137,59 +140,72 @@ def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
         slope, constant = np.polyfit(sizes, [row[f"{name}_seconds"] / STEPS for row in one], 1, w=1 / np.array(sizes))
         constants |= {f"{name}_per_step": max(constant, 0.0), f"{name}_per_sample": slope}
     for name in ("physics", "update"):
-        speeds = [np.median([row[f"{name}_seconds"] / row["num_envs"] / STEPS for row in some]) for some in (one, two)]
-        constants |= {
-            f"{name}_per_sample": speeds[0],
-            f"{name}_serial": float(np.clip(2 * speeds[1] / speeds[0] - 1, 0, 1)),
-        }
+        seconds = [[row[f"{name}_seconds"] / row["num_envs"] / STEPS for row in some] for some in (one, two)]
+        gain = float(np.median(np.divide(*seconds)))
+        constants |= {f"{name}_per_sample": np.median(seconds[0]), f"{name}_gain": float(np.clip(gain, 1, 2))}
     return {name: float(value) for name, value in constants.items()}
 
 
-def predict(num_envs: int, cores: int, gpu: bool, c: dict[str, float]) -> float:
+def predict(num_envs: int, cores: int, gpu: bool, c: dict[str, float], *, linear: bool) -> int:
     """Return samples per second of ``cores`` cores, with or without a GPU, by the model's constants."""
 
     def speed_up(name: str) -> float:
-        return 1 / (c[f"{name}_serial"] + (1 - c[f"{name}_serial"]) / cores)
+        gain = c[f"{name}_gain"]
+        if linear:
+            return 1 + (cores - 1) * (gain - 1)
+        serial = 2 / gain - 1
+        return 1 / (serial + (1 - serial) / cores)
 
     samples = num_envs * STEPS
     physics = samples * c["physics_per_sample"] / speed_up("physics")
     rest = STEPS * c["other_per_step"] + samples * c["other_per_sample"]
     if not gpu:
         forward = STEPS * c["forward_per_step"] + samples * c["forward_per_sample"]
-        return samples / (physics + rest + forward + samples * c["update_per_sample"] / speed_up("update"))
+        return round(samples / (physics + rest + forward + samples * c["update_per_sample"] / speed_up("update")))
     starts, rate = GPU["operations_per_second"], GPU["flops"]
     forward = STEPS * max(c["forward_operations"] / starts, num_envs * c["forward_flops"] / rate)
     forward += STEPS * TRANSFERS * GPU["seconds_per_transfer"]
     steps = EPOCHS * max(samples / MINIBATCH, 1)
     update = steps * max(c["step_operations"] / starts, min(MINIBATCH, samples) * c["step_flops"] / rate)
-    return samples / (physics + rest + forward + update)
+    return round(samples / (physics + rest + forward + update))
 
 
 def main() -> None:
     """Measure, fit, predict, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--refit", action="store_true")
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
     sizes = QUICK_SIZES if arguments.quick else SIZES
-    rows = [measure(size, threads, 0) for size in sizes for threads in (1, 2)]
-    rows += [measure(size, 1, workers) for size in sizes[1:3] for workers in (1, 2)]
+    output = arguments.output or (None if arguments.quick else RESULTS)
+    if not arguments.refit:
+        rows = [measure(size, threads, 0) for size in sizes for threads in (1, 2)]
+        rows += [measure(size, 1, workers) for size in sizes[1:3] for workers in (1, 2)]
+        rows = [row | about() for row in rows]
+        print(table([{key: row[key] for key in MEASURED} for row in rows]))
+        if output:
+            write(output, rows)
+    else:
+        rows = read(output or RESULTS)
     constants = fit(rows) | count()
     predictions = [
-        {"machine": name, "num_envs": size, "samples_per_second": round(predict(size, cores, gpu, constants))}
-        for name, (cores, gpu) in MACHINES.items()
+        {"machine": name, "num_envs": size}
+        | {bound: predict(size, *machine, constants, linear=bound == "high") for bound in ("low", "high")}
+        for name, machine in MACHINES.items()
         for size in sizes
     ]
-    print(table(rows), table(predictions), *(f"{name} {value:.4g}" for name, value in constants.items()), sep="\n")
-    if output := arguments.output or (None if arguments.quick else RESULTS):
-        machine = about()
-        write(output, [row | machine for row in rows])
-        model = [{"name": name, "value": f"{value:.6g}"} for name, value in (constants | GPU).items()]
-        model += [
-            {"name": f"{p['machine']}, {p['num_envs']} environments", "value": p["samples_per_second"]}
-            for p in predictions
-        ]
-        write(output.with_name(f"{output.stem}_model.csv"), model)
+    print(table(predictions), *(f"{name} {value:.4g}" for name, value in constants.items()), sep="\n")
+    if output:
+        write(output.with_name(f"{output.stem}_predicted.csv"), predictions)
+        values = [{"constant": name, "value": f"{value:.4g}"} for name, value in (constants | GPU).items()]
+        write(output.with_name(f"{output.stem}_constants.csv"), values)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the measurements of a file."""
+    with path.open(newline="") as file:
+        return [row | {key: float(row[key]) for key in MEASURED} for row in csv.DictReader(file)]
 
 
 if __name__ == "__main__":

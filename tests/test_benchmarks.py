@@ -5,6 +5,7 @@ import importlib.util
 import runpy
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -88,3 +89,23 @@ def test_tasks_are_measured_beside_bare_mujoco(tmp_path):
     (row,) = rows
     assert float(row["of_raw"]) > 0
     assert 0 < float(row["physics"]) < 1
+
+
+def test_the_model_of_scaling_finds_the_constants_that_made_the_times_and_predicts_by_them(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    scaling = runpy.run_path(str(BENCHMARKS / "scaling.py"))
+    steps, rows = scaling["STEPS"], []
+    for size, threads in product((64, 256, 1024), (1, 2)):
+        row = {"num_envs": size, "threads": threads, "workers": 0}
+        row["physics_seconds"] = steps * size * 1e-4 / (1, 1.5)[threads - 1]
+        row["update_seconds"] = steps * size * 2e-4 / (1, 2)[threads - 1]
+        rows.append(row | {"forward_seconds": steps * (1e-3 + size * 1e-5), "other_seconds": steps * 2e-3})
+    found = scaling["fit"](rows)
+    expected = {"physics_per_sample": 1e-4, "physics_gain": 1.5, "update_per_sample": 2e-4, "update_gain": 2.0}
+    expected |= {"forward_per_step": 1e-3, "forward_per_sample": 1e-5, "other_per_step": 2e-3, "other_per_sample": 0}
+    assert found == pytest.approx(expected, abs=1e-9)
+    # Four cores: a third of physics is serial by Amdahl's law, and the update divides by four.
+    seconds = 1e-4 * (1 / 3 + 2 / 3 / 4) + 2e-4 / 4 + 1e-5 + 3e-3 / 256
+    assert scaling["predict"](256, 4, False, found, linear=False) == pytest.approx(1 / seconds, rel=1e-3)
+    seconds += 1e-4 / 2.5 - 1e-4 * (1 / 3 + 2 / 3 / 4)
+    assert scaling["predict"](256, 4, False, found, linear=True) == pytest.approx(1 / seconds, rel=1e-3)
