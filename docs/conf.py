@@ -36,6 +36,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(argparse|collections|dataclasses|datetime|pathlib|typing)\..*"),
     (r"py:.*", r"(gymnasium|hydra|matplotlib|mujoco|numpy|omegaconf|PIL|tensordict|torch|torchrl)\..*"),
     (r"py:class", r".*\._AcceptedKeys"),  # TorchRL's way of naming keys
+    (r"py:class", r".*\.threads\.Result"),  # a type variable
 ]
 
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}

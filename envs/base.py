@@ -176,7 +176,7 @@ class CharacterEnv(EnvBase):
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Step all simulations and begin new episodes where they have ended; see ``EnvBase.step_and_maybe_reset``.
 
-        The same as TorchRL's, but for what is known here: specs hold by construction, and what :meth:`_emit` tells
+        The same as TorchRL's, but for what is known here: specs hold by construction, and what ``_emit`` tells
         after a partial reset is what is shown of all simulations, so that nothing needs merging.
         """
         if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:

@@ -59,7 +59,7 @@ COLUMNS = (
     "torque/limit",
     "rest pose leans",
 )
-"""Of the table, from the modules ``summary`` and ``feasibility`` of :mod:`torchrl_mcp.envs.motions.inspection`."""
+"""Of the table, from ``summary`` and ``feasibility`` of ``torchrl_mcp.envs.motions.inspection``."""
 
 STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
     "length m": lambda strides: strides.stride_length,
