@@ -141,3 +141,22 @@ def test_all_gates_closed_are_a_mixture_in_equal_parts_when_validation_is_off():
     closed, equal = (AdditiveGaussian(loc, scale, g, validate_args=False) for g in (gates * 0, gates * 0 + 1))
     torch.testing.assert_close(closed.log_prob(loc[:, 0]), equal.log_prob(loc[:, 0]))
     assert closed.sample().isfinite().all()
+
+
+@pytest.mark.parametrize("gate", [1e-30, 1e-38, 5e-39, 1e-42, 2e-45])
+def test_a_primitive_with_a_subnormal_gate_counts_where_it_alone_explains_the_action(gate):
+    loc, scale, action = torch.tensor([[0.0, 0.0], [10.0, 10.0]]), torch.full((2, 2), 0.5), torch.tensor([10.2, 9.9])
+    gates = torch.tensor([1.0, gate])
+    exact = Normal(10.0, 0.5).log_prob(action.double()).sum() + gates[1].double().log()
+    gates.requires_grad_()
+    log_prob = AdditiveGaussian(loc, scale, gates).log_prob(action)
+    torch.testing.assert_close(log_prob.double(), exact, atol=1e-4, rtol=0)
+    (gradient,) = torch.autograd.grad(log_prob, gates)
+    assert gradient.isfinite().all()
+    if gate >= 3e-39:  # the inverse of a smaller one is beyond float32
+        torch.testing.assert_close(gradient[1] * gates[1].detach(), torch.tensor(1.0))
+
+
+def test_the_mode_is_refused_with_the_remedy():
+    with pytest.raises(NotImplementedError, match="deterministic_sample"):
+        _ = AdditiveGaussian(*random_primitives()).mode

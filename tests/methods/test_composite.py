@@ -2,6 +2,9 @@
 
 import pytest
 import torch
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -21,6 +24,21 @@ def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives
         parts = composite(**heads, num_primitives=num_primitives, gain=gain, initial_std=0.17)
         stddev = composite_actor(parts, **heads).trained.get_dist(states(50)).stddev
         torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=tolerance)
+
+
+@pytest.mark.parametrize("method", ["mcp", "moe"])
+def test_what_a_composite_plays_in_one_state_varies_by_the_standard_deviation_asked_for(method):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        cfg = compose("train", [f"method={method}", "task=imitation"])
+    torch.manual_seed(1)
+    parts = instantiate(cfg.parts)(105, 208, 17)
+    actor = instantiate(cfg.actor)(parts)
+    states = TensorDict(observation=torch.randn(64, 105), goal=torch.randn(64, 208), batch_size=64)
+    with torch.no_grad():
+        actions = actor.trained.get_dist(states).sample((2000,))
+    assert actions.var(0).mean().sqrt().item() == pytest.approx(cfg.character.action_std, rel=0.03)
+    loc, _ = parts["primitives"](states["observation"])
+    assert loc.std(-2).mean() > 0.3 * cfg.character.action_std  # they differ, so that the gate has a choice
 
 
 @pytest.mark.parametrize("mixer", MIXERS)

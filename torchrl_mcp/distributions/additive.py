@@ -82,11 +82,14 @@ class AdditiveGaussian(MixtureSameFamily):
         info = torch.finfo(gates.dtype)
         # Not inherited, because torch raises every weight to 1e-7: a closed primitive would then own the tails, and
         # get no gradient. Around this anchor, which cancels, an open primitive adds at most 1 to the sum.
-        anchor = (gates.log() + log_probs).amax(-1, keepdim=True).detach()
-        excess = log_probs - anchor
-        # A closed one adds nothing however likely it makes the action; only its slope needs a bound.
-        excess = torch.where(gates < info.tiny, excess.clamp_max(-math.log(info.eps)), excess)
-        return anchor.squeeze(-1) + (gates * excess.exp()).sum(-1).log()
+        shares = gates.log() + log_probs
+        anchor = shares.amax(-1, keepdim=True).detach()
+        # A closed one adds nothing however likely it makes the action; only its slope needs a bound. That of one whose
+        # gate is subnormal is bounded by what the type can hold.
+        bound = torch.where(gates > 0, math.log(info.max) - 0.5, -math.log(info.eps))
+        terms = gates * (log_probs - anchor).clamp_max(bound).exp()
+        terms = torch.where(gates < info.tiny, terms + ((shares - anchor).exp() - terms).detach(), terms)
+        return anchor.squeeze(-1) + terms.sum(-1).log()
 
     def entropy(self, num_samples: int = 1) -> Tensor:
         r"""Estimate the entropy without bias in its value or its gradient.
@@ -106,6 +109,18 @@ class AdditiveGaussian(MixtureSameFamily):
         actions = self.component_distribution.rsample((num_samples,)).movedim(-2, 0)
         gates = self.mixture_distribution.probs.movedim(-1, 0).unsqueeze(1)
         return -(gates * self.log_prob(actions)).sum(0).mean(0)
+
+    @property
+    def mode(self) -> Tensor:
+        """Raise an error: the densest action of a mixture has no closed form.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError(
+            "the mode of a Gaussian mixture has no closed form: use deterministic_sample, the mean of the most likely "
+            "primitive, with TorchRL as ExplorationType.DETERMINISTIC"
+        )
 
     @property
     def deterministic_sample(self) -> Tensor:

@@ -45,10 +45,13 @@ def composite_parts(
         action_dim: Size of the action, ``A``.
         gating: Makes the network for gate logits from ``(S, G, K)``.
         gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
-        primitives: Makes the primitives from ``(S, A, K, initial_std=)``.
+        primitives: Makes the primitives from ``(S, A, K, initial_std=)``; what it makes has a method ``rescale``, as
+            :meth:`~torchrl_mcp.modules.Primitives.rescale`.
         num_primitives: Number of primitives, ``K``.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
-        initial_std: Standard deviation of the *composite* before training, in action units, whatever ``K`` and mixer.
+        initial_std: Standard deviation of the *composite* before training, in action units, whatever ``K`` and mixer:
+            of its actions in one state, by the spread of each primitive and by what lies between them, as a root mean
+            square over normalised states and over actions.
         normaliser: Makes an input normaliser from a size.
 
     Raises:
@@ -56,11 +59,12 @@ def composite_parts(
     """
     if num_primitives < 1:
         raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
-    # Both mixers scale with their primitives: compose K unit Gaussians at the gate's initial weights and divide.
+    # Both mixers scale with their primitives. First compose K unit Gaussians at the gate's initial weights and divide;
+    # then do the same with the networks as they are, whose primitives lie apart from one another.
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
-    return nn.ModuleDict(
+    parts = nn.ModuleDict(
         {
             **input_normalisers(observation_dim, goal_dim, normaliser),
             "gating": gating(observation_dim, goal_dim, num_primitives),
@@ -69,6 +73,17 @@ def composite_parts(
             ),
         }
     )
+    with torch.no_grad():
+        states, goals = _normalised_inputs(observation_dim, goal_dim)
+        composite = distribution_class(*parts["primitives"](states), gate_activation(parts["gating"](states, goals)))
+        parts["primitives"].rescale(initial_std / composite.stddev.square().mean().sqrt().item())
+    return parts
+
+
+def _normalised_inputs(observation_dim: int, goal_dim: int, num: int = 1024) -> tuple[Tensor, Tensor]:
+    """Return states ``(num, S)`` and goals ``(num, G)`` of zero mean and unit variance, the same at every call."""
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(num, observation_dim, generator=generator), torch.randn(num, goal_dim, generator=generator)
 
 
 def composite_actor(

@@ -64,6 +64,14 @@ class Primitives(nn.Module):
         loc, log_scale = self.output(features).chunk(2, dim=-1)
         return loc, log_scale.float().exp()
 
+    @torch.no_grad()
+    def rescale(self, factor: float) -> None:
+        """Multiply all means and standard deviations by ``factor``, positive."""
+        action_dim = self.output.bias.shape[-1] // 2
+        self.output.weight[..., :action_dim] *= factor
+        self.output.bias[:, :action_dim] *= factor
+        self.output.bias[:, action_dim:] += math.log(factor)
+
 
 class BatchedLinear(nn.Module):
     """K linear layers side by side: ``(*B, K, I)``, or ``(*B, 1, I)`` shared by all, to ``(*B, K, O)``.
