@@ -22,6 +22,7 @@ from torchrl_mcp.methods.actor import (
     sampler,
 )
 from torchrl_mcp.modules.normaliser import RunningNormaliser
+from torchrl_mcp.modules.primitives import Primitives
 
 
 def composite_parts(
@@ -31,7 +32,7 @@ def composite_parts(
     *,
     gating: Callable[..., nn.Module],
     gate_activation: Callable[[Tensor], Tensor],
-    primitives: Callable[..., nn.Module],
+    primitives: Callable[..., Primitives],
     num_primitives: int,
     distribution_class: Composition,
     initial_std: float,
@@ -64,20 +65,22 @@ def composite_parts(
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
-    parts = nn.ModuleDict(
-        {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
-            "gating": gating(observation_dim, goal_dim, num_primitives),
-            "primitives": primitives(
-                observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
-            ),
-        }
+    gate = gating(observation_dim, goal_dim, num_primitives)
+    networks = primitives(
+        observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
     )
     with torch.no_grad():
         states, goals = _normalised_inputs(observation_dim, goal_dim)
-        composite = distribution_class(*parts["primitives"](states), gate_activation(parts["gating"](states, goals)))
-        parts["primitives"].rescale(initial_std / composite.stddev.square().mean().sqrt().item())
-    return parts
+        loc, scale = networks(states)
+        composite = distribution_class(loc, scale, gate_activation(gate(states, goals)))
+        networks.rescale(initial_std / composite.stddev.square().mean().sqrt().item())
+    return nn.ModuleDict(
+        {
+            **input_normalisers(observation_dim, goal_dim, normaliser),
+            "gating": gate,
+            "primitives": networks,
+        }
+    )
 
 
 def _normalised_inputs(observation_dim: int, goal_dim: int, num: int = 1024) -> tuple[Tensor, Tensor]:
