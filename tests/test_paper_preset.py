@@ -1,11 +1,13 @@
-"""Tables 5-11 of the paper as data, against what ``preset=paper`` composes."""
+"""Tables 5-11 of the paper as data, against the trainer that ``preset=paper`` builds."""
 
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_module
 
 from torchrl_mcp import conf
+from torchrl_mcp.runs import build
 
 CHARACTERS = ("biped", "humanoid", "trex")
 
@@ -54,51 +56,142 @@ TABLES = {
 # Appendix E, before the tables.
 DISCOUNT = {"pretrain": 0.95, "transfer": 0.99}
 
-SETTINGS = {
-    "k Primitives": "num_primitives",
-    "k Options": "num_options",
-    "w Latent Size": "latent_dim",
-    "pi Stepsize": "optimizer.actor.lr",
-    "pi Stepsize (Pre-Train)": "optimizer.actor.lr",
-    "pi Stepsize (Transfer)": "optimizer.actor.lr",
-    "beta Stepsize": "optimizer.actor.lr",
-    "V Stepsize": "optimizer.critic.lr",
-    "Q Stepsize": "optimizer.critic.lr",
-    "Batch Size": "training.frames_per_batch",
-    "Minibatch Size": "training.minibatch_size",
-    "SGD Momentum": "optimizer.actor.momentum",
-    "TD(lambda)": "objective.advantages.lmbda",
-    "GAE(lambda)": "objective.advantages.lmbda",
-    "PPO Clip Threshold": "objective.loss.clip_epsilon",
-    "Termination Cost": "objective.advantages.termination_cost",
-    "beta KL Regularizer": "objective.loss.kl_coeff",
+# The same authors' public code of DeepMimic, whose imitation section 4 takes over: weights and scales.
+REWARD = {
+    "pose": (0.5, 2.0),
+    "velocity": (0.05, 0.1),
+    "key_positions": (0.15, 40.0),  # of the end effectors
+    "root_pose": (0.2, 5.0),
+    "com": (0.1, 10.0),
 }
+
+# Appendix E: hidden units.
+LAYERS = {
+    ("mcp", "pretrain"): {"gating": {512, 256}, "primitives": {512, 256}},
+    ("mcp", "transfer"): {"gating": {512, 256}},
+    ("scratch", "transfer"): {"policy": {1024, 512}},
+    **{("finetune", stage): {"policy": {1024, 512}} for stage in ("pretrain", "transfer")},
+    ("hierarchical", "pretrain"): {"primitives": {1024, 512}},
+    ("hierarchical", "transfer"): {"gating": {1024, 512}},
+    **{("option_critic", stage): {"critic": {1024, 512}} for stage in ("pretrain", "transfer")},
+    ("moe", "pretrain"): {"gating": {1024, 512}, "primitives": {1024, 512}},
+    ("moe", "transfer"): {"gating": {1024, 512}},
+    ("latent_space", "pretrain"): {"encoder": {256, 128}, "decoder": {1024, 512}},
+    ("latent_space", "transfer"): {"encoder": {1024, 512}},
+}
+
+STEP_SIZES = ("pi Stepsize", "pi Stepsize (Pre-Train)", "pi Stepsize (Transfer)", "beta Stepsize")
 METHODS = sorted({path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml")} & set(TABLES))
 
 
-def setting(cfg, path):
-    for key in path.split("."):
-        cfg = cfg[key]
-    return cfg
+def configure(method, stage, *overrides):
+    task = {"pretrain": "imitation", "transfer": "heading"}[stage]
+    settings = ["preset=paper", f"method={method}", f"stage={stage}", f"task={task}", "num_threads=1", *overrides]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", settings)
+
+
+@pytest.fixture(scope="module", params=sorted(LAYERS), ids="-".join)
+def built(request, tmp_path_factory):
+    """A method, a stage, and the trainer of the biped that the preset builds for them."""
+    method, stage = request.param
+    folder = tmp_path_factory.mktemp("run")
+    cfg = configure(method, stage, f"run_dir={folder}")
+    source = build.make_source(cfg)
+    return method, stage, build.make_trainer(cfg, build.make_agent(cfg, source.env), source, folder)
+
+
+def step_size(trainer, name):
+    """How far the trainer goes along a gradient of 1000 at the first step, for each unit of it; if it trains that."""
+    if name not in trainer.optimizers:
+        return None
+    (group,) = trainer.optimizers[name].param_groups
+    before = [parameter.detach().clone() for parameter in group["params"]]
+    for parameter in group["params"]:
+        parameter.grad = torch.full_like(parameter, 1000.0)
+    trainer._step(trainer.optimizers[name])
+    gone = {round((old - new).median().item() / 1000, 9) for old, new in zip(before, group["params"], strict=True)}
+    assert max(gone) - min(gone) < 1e-3 * max(gone)
+    return max(gone)
+
+
+def decays(trainer):
+    estimator = getattr(trainer.advantages, "gae", trainer.advantages)
+    return float(estimator.lmbda), float(estimator.gamma)
+
+
+def skills(trainer):
+    """How many primitives, options or latent numbers there are, by the sizes of the networks."""
+    parts = trainer.parts
+    if "decoder" in parts:
+        return parts["decoder"].body[0].in_features - parts["observation_normaliser"].mean.numel()
+    if "primitives" in parts:
+        return len(getattr(parts["primitives"], "policies", [])) or parts["primitives"].output.bias.shape[0]
+    return parts["options"].output.bias.shape[0]
+
+
+def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
+    method, stage, trainer = built
+    other = {"pretrain": "(Transfer)", "transfer": "(Pre-Train)"}[stage]
+    table = {row: values[0] for row, values in TABLES[method].items() if not row.endswith(other)}
+    if method == "hierarchical" and stage == "pretrain":
+        table["pi Stepsize"] = TABLES["scratch"]["pi Stepsize"][0]  # Table 8 is of the gate
+    lmbda, gamma = decays(trainer)
+    assert lmbda == pytest.approx(0.95)
+    assert gamma == pytest.approx(DISCOUNT[stage])
+    assert (trainer.frames_per_batch, trainer.minibatch_size) == (table["Batch Size"], 256)
+    assert (trainer.num_epochs, trainer.schedule, trainer.autocast) == (1, None, False)
+    for optimizer in trainer.optimizers.values():
+        (group,) = optimizer.param_groups
+        assert isinstance(optimizer, torch.optim.SGD)
+        assert (group["momentum"], group["weight_decay"], group["nesterov"]) == (table["SGD Momentum"], 0, False)
+    assert step_size(trainer, "critic") == pytest.approx(table.get("V Stepsize", table.get("Q Stepsize")), rel=1e-3)
+    steps = {value for row, value in table.items() if row in STEP_SIZES}
+    if method == "option_critic" and stage == "transfer":
+        assert step_size(trainer, "actor") is None  # options and terminations are kept
+    else:
+        assert [step_size(trainer, "actor")] == [pytest.approx(step, rel=0.01) for step in steps]
+    if "PPO Clip Threshold" in table:
+        assert float(trainer.losses["actor"].clip_epsilon) == pytest.approx(table["PPO Clip Threshold"])
+    if "Termination Cost" in table:
+        assert trainer.advantages.termination_cost == table["Termination Cost"]
+    if "beta KL Regularizer" in table:
+        assert trainer.losses["actor"].kl_coeff == table["beta KL Regularizer"]
+    for row in ("k Primitives", "k Options", "w Latent Size"):
+        if row in table:
+            assert skills(trainer) == table[row]
+
+
+def test_the_preset_builds_the_layers_of_appendix_e(built):
+    method, stage, trainer = built
+    for part, widths in {**LAYERS[method, stage], "critic": {1024, 512}}.items():
+        linear = [layer for layer in trainer.parts[part].modules() if isinstance(layer, torch.nn.Linear)]
+        hidden = {layer.out_features for layer in linear if layer.out_features > 34}
+        assert hidden == widths, part
+
+
+def test_the_preset_imitates_by_the_reward_of_deepmimic(built):
+    method, stage, trainer = built
+    if stage == "transfer":
+        return
+    env = trainer.source.env
+    assert {name: (term.weight, term.scale) for name, term in env.terms.items()} == REWARD
+    switches_randomly = method not in ("finetune", "hierarchical")  # which imitate a single motion, or one each
+    assert (env.switch_candidates == 1, env.switch_to) == (switches_randomly, "any" if switches_randomly else "same")
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "transfer"])
 @pytest.mark.parametrize("method", METHODS)
-def test_the_paper_preset_holds_the_table_of_each_method(method, stage):
-    task = {"pretrain": "imitation", "transfer": "heading"}[stage]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", ["preset=paper", f"method={method}", f"stage={stage}", f"task={task}"])
-    assert cfg.optimizer.actor["_target_"] == cfg.optimizer.critic["_target_"] == "torch.optim.SGD"
-    assert cfg.optimizer.critic.momentum == cfg.optimizer.actor.momentum
-    assert cfg.stage.gamma == DISCOUNT[stage]
+def test_the_preset_has_the_step_sizes_of_each_character(method, stage):
+    cfg = configure(method, stage)
     other = {"pretrain": "(Transfer)", "transfer": "(Pre-Train)"}[stage]
     for row, values in TABLES[method].items():
-        if row.endswith(other):
+        if row not in STEP_SIZES or row.endswith(other):
             continue
         for character, value in zip(CHARACTERS, values, strict=False):
             cfg.character.name = character
-            assert setting(cfg, SETTINGS[row]) == value, (row, character)
+            assert cfg.optimizer.actor.lr == value, (row, character)
         if method != "hierarchical":
             # No table has the ant: it takes the biped's values. The paper has no hierarchical model of it.
             cfg.character.name = "ant"
-            assert setting(cfg, SETTINGS[row]) == values[0], (row, "ant")
+            assert cfg.optimizer.actor.lr == values[0], (row, "ant")

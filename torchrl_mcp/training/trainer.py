@@ -1,5 +1,6 @@
 """The training loop: collect, estimate advantages, update, record. One loop for every method."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -58,7 +59,7 @@ class Trainer:
         frames_per_batch: Environment steps per iteration, ``N * T``.
         minibatch_size: Samples per gradient step.
         num_epochs: Passes over each batch.
-        max_grad_norm: Largest gradient norm, of actor and critic each.
+        max_grad_norm: Largest gradient norm, of actor and critic each, or None to leave gradients as they are.
         step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
         autocast: Run all networks in bfloat16 autocast, in source and loss alike.
         device: Where the networks are; physics stays on the CPU.
@@ -87,7 +88,7 @@ class Trainer:
         frames_per_batch: int,
         minibatch_size: int,
         num_epochs: int,
-        max_grad_norm: float,
+        max_grad_norm: float | None,
         step_size_schedule: Callable[[Optimizer], KLAdaptiveLR] | None,
         autocast: bool,
         device: torch.device | str,
@@ -108,7 +109,8 @@ class Trainer:
         )
         self.frozen, self.metrics_writer, self.checkpoints, self.config = frozen, metrics_writer, checkpoints, config
         self.total_frames, self.frames_per_batch = total_frames, frames_per_batch
-        self.minibatch_size, self.num_epochs, self.max_grad_norm = minibatch_size, num_epochs, max_grad_norm
+        self.minibatch_size, self.num_epochs = minibatch_size, num_epochs
+        self.max_grad_norm = math.inf if max_grad_norm is None else max_grad_norm
         self.device, self.autocast = torch.device(device), autocast
         self.checkpoint_interval, self.progress_bar = checkpoint_interval, progress_bar
         self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(num_envs), Stopwatch()
@@ -205,7 +207,7 @@ class Trainer:
         return reports
 
     def _step(self, optimizer: Optimizer) -> Tensor:
-        """Clip the gradient, step, and give the gradient's norm."""
+        """Clip the gradient, step, and give the norm that it had."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         optimizer.step()
