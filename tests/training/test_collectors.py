@@ -1,8 +1,10 @@
 """Collection in workers: the same as in this process, but elsewhere."""
 
 import csv
+import multiprocessing
 import subprocess
 import sys
+import time
 from functools import partial
 from importlib.util import find_spec
 
@@ -14,6 +16,7 @@ from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint, collectors
 from torchrl_mcp.training.collectors import RemoteSource
+from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Stopwatch
 
 SMOKE = ["preset=smoke", "logger=none", "progress_bar=false"]
@@ -108,6 +111,35 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     assert batch["option"].unique().numel() > 2
     assert batch["held_option"][:, 1:].equal(batch["option"][:, :-1])
     assert watch.seconds["collection"] > 0
+
+
+def test_a_killed_worker_ends_the_run_within_seconds_by_name_and_leaves_none(tmp_path, monkeypatch):
+    def begin(source, *arguments, **settings):
+        start(source, *arguments, **settings)
+        workers.extend(source._workers)
+
+    def kill_one(writer, metrics, *, step):
+        workers[1].kill()
+        killed.append(time.monotonic())
+
+    start, workers, killed = RemoteSource.start, [], []
+    monkeypatch.setattr(RemoteSource, "start", begin)
+    monkeypatch.setattr(MetricsWriter, "write", kill_one)
+    with pytest.raises(ChildProcessError, match=r"worker 1 of 2 .* has ended by signal SIGKILL"):
+        experiment.train(configure(tmp_path, "collector=processes"))
+    assert time.monotonic() - killed[0] < 15
+    assert len(workers) == 2
+    assert not set(workers) & set(multiprocessing.active_children())
+
+
+def test_a_worker_follows_the_process_that_started_it(monkeypatch):
+    called = []
+    monkeypatch.setattr(collectors, "end_with_parent", lambda: called.append(True))
+    before = torch.get_rng_state(), torch.get_num_threads()
+    assert collectors._begin_worker(lambda seed: seed, seed=3) == 3
+    torch.set_rng_state(before[0])
+    torch.set_num_threads(before[1])
+    assert called
 
 
 def test_environments_that_do_not_divide_evenly_are_refused():

@@ -14,6 +14,7 @@ from hydra import compose, initialize_config_module
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint, trainer
+from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.threads import threads
 from torchrl_mcp.training.trainer import Trainer
 
@@ -69,6 +70,19 @@ def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp
     expected = final_parts(whole)
     for name, value in final_parts(killed).items():
         assert torch.equal(value, expected[name]), name
+
+
+@pytest.mark.parametrize("failure", [FloatingPointError, KeyboardInterrupt])
+def test_the_trajectory_source_is_stopped_when_a_run_fails(tmp_path, monkeypatch, failure):
+    def fail(*arguments, **settings):
+        raise failure
+
+    stopped, stop = [], LocalSource.stop
+    monkeypatch.setattr(LocalSource, "stop", lambda source: stopped.append(stop(source)))
+    monkeypatch.setattr(Trainer, "_update", fail)
+    with pytest.raises(failure):
+        experiment.train(configure(tmp_path / "run"))
+    assert len(stopped) == 1
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pretrained):

@@ -1,13 +1,12 @@
 """Functions that run side by side, each in its own process."""
 
 import multiprocessing
-import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.process import BaseProcess
 from typing import Any
+
+from torchrl_mcp.training.workers import end_with_parent
 
 
 def start(function: Callable[..., None], *args: Any) -> BaseProcess:
@@ -32,17 +31,8 @@ def ticks(processes: Sequence[BaseProcess], interval: float) -> Iterator[None]:
 
 
 def _call(function: Callable[..., None], *args: Any) -> None:
-    # An interrupt goes to parent and children alike; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     try:
         function(*args)
     except ValueError as error:
         sys.exit(str(error))
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

@@ -16,8 +16,12 @@ from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads
+from torchrl_mcp.training.workers import attend, end, end_with_parent, new_workers
 
 Environments = CharacterEnv | TransformedCharacterEnv
+
+PATIENCE = 5.0
+"""Seconds that workers have to end by themselves."""
 
 
 class TrajectorySource(Protocol):
@@ -198,35 +202,41 @@ class RemoteSource:
         seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
         self._starts += 1
         random = GlobalRNGState().state_dict()
-        self._collector = Collector(
-            [partial(self._make_env, seed=int(seed)) for seed in seeds],
-            _Autocast(policy, device) if autocast else policy,
-            num_collectors=self.num_workers,
-            sync=True,
-            frames_per_batch=frames_per_batch,
-            total_frames=frames_per_batch * 10**9,  # not all backends know of an endless collection
-            env_device="cpu",
-            policy_device=device,
-            storing_device=device,
-            **self._backend,
-        )
+        with new_workers() as self._workers:
+            self._collector = Collector(
+                [partial(self._make_env, seed=int(seed)) for seed in seeds],
+                _Autocast(policy, device) if autocast else policy,
+                num_collectors=self.num_workers,
+                sync=True,
+                frames_per_batch=frames_per_batch,
+                total_frames=frames_per_batch * 10**9,  # not all backends know of an endless collection
+                env_device="cpu",
+                policy_device=device,
+                storing_device=device,
+                **self._backend,
+            )
         GlobalRNGState().load_state_dict(random)
         self._batches: Iterator[TensorDictBase] | None = None
 
     def collect(self) -> TensorDictBase:
-        """Return the next trajectories, of the newest weights; the time goes to ``collection``."""
+        """Return the next trajectories, of the newest weights; the time goes to ``collection``.
+
+        Raises:
+            ChildProcessError: If a worker on this machine has ended.
+        """
         with self._stopwatch("collection"):
-            self._collector.update_policy_weights_()
-            self._batches = self._batches or iter(self._collector)
-            return next(self._batches).reshape(self.num_envs, self._steps).to(self._device)
+            return attend(self._next, self._workers).reshape(self.num_envs, self._steps).to(self._device)
 
     def metrics(self) -> dict[str, float]:
         """Return nothing: the environments are elsewhere."""
         return {}
 
     def stop(self) -> None:
-        """Stop the workers."""
-        self._collector.shutdown()
+        """Stop the workers, also those that hang."""
+        try:
+            self._collector.shutdown(timeout=PATIENCE)
+        finally:
+            end(self._workers)
 
     def state_dict(self) -> dict[str, Any]:
         """Return how often the workers have been started."""
@@ -235,6 +245,11 @@ class RemoteSource:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore how often they have been started, so that they begin with other episodes."""
         self._starts = state["starts"]
+
+    def _next(self) -> TensorDictBase:
+        self._collector.update_policy_weights_()
+        self._batches = self._batches or iter(self._collector)
+        return next(self._batches)
 
 
 class _Autocast(TensorDictModuleBase):
@@ -253,6 +268,7 @@ class _Autocast(TensorDictModuleBase):
 
 def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **settings: int) -> Environments:
     """Return the environments of a worker, in its process, whose exploration is its own."""
+    end_with_parent()
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     return make_env(seed=seed, **settings)

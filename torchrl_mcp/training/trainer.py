@@ -133,6 +133,27 @@ class Trainer:
             autocast=self.autocast,
             stopwatch=self.stopwatch,
         )
+        try:
+            self._loop()
+        finally:
+            self.source.stop()
+
+    def restore(self, path: Path) -> None:
+        """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
+
+        Raises:
+            ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
+        """
+        load(self.checkpoint, path)
+        if not self.source.resumes_episodes:
+            self.episodes = EpisodeStatistics(self.source.num_envs)
+        self.metrics_writer.rewind(self.progress.iteration)
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
+
+    def _loop(self) -> None:
         with tqdm(
             total=self.total_frames, initial=self.progress.frames, unit="step", disable=not self.progress_bar
         ) as bar:
@@ -150,22 +171,6 @@ class Trainer:
                 self._advance(metrics, time.perf_counter() - start)
                 bar.set_postfix_str(self._summary(metrics), refresh=False)
                 bar.update(batch.numel())
-        self.source.stop()
-
-    def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
-
-        Raises:
-            ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
-        """
-        load(self.checkpoint, path)
-        if not self.source.resumes_episodes:
-            self.episodes = EpisodeStatistics(self.source.num_envs)
-        self.metrics_writer.rewind(self.progress.iteration)
-
-    def save(self) -> None:
-        """Write a checkpoint."""
-        self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
 
     def _behaviour(self) -> TensorDictModuleBase:
         """Return the policy as it collects: what it writes is what the loss reads, and no more."""
