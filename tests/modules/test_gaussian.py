@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_mcp.modules import GaussianPolicy
+from torchrl_mcp.modules import GaussianPolicy, InjectedPolicy
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,25 @@ def test_its_standard_deviation_is_given_and_does_not_learn(std, expected):
     _, scale = policy(torch.randn(10, 27), torch.randn(10, 2))
     torch.testing.assert_close(scale, torch.tensor(expected).expand(10, 3))
     assert not scale.requires_grad
-    assert "scale" in policy.state_dict()
+    assert "scale.state_independent_scale" in policy.state_dict()
+
+
+@pytest.mark.parametrize("network", [GaussianPolicy, InjectedPolicy])
+def test_a_standard_deviation_that_learns_shrinks_where_noise_costs_reward(network):
+    torch.manual_seed(0)
+    injected = network is InjectedPolicy
+    policy = network(3, *([] if injected else [2]), 2, num_cells=(8, 6), std=[0.1, 0.2], learned_std=True)
+    inputs = torch.randn(64, 3), torch.zeros(()) if injected else torch.randn(64, 2)
+    loc, scale = policy(*inputs)
+    torch.testing.assert_close(scale, torch.tensor([0.1, 0.2]).expand(64, 2))
+    action = loc + scale * torch.randn(64, 2)
+    advantage = -(action - loc).square().sum(-1).detach()
+    surrogate = torch.distributions.Normal(loc, scale).log_prob(action.detach()).sum(-1) * (
+        advantage - advantage.mean()
+    )
+    (-surrogate.mean()).backward()
+    torch.optim.SGD(policy.parameters(), lr=1.0).step()
+    assert (policy(*inputs)[1] < scale).all()
 
 
 @pytest.mark.parametrize("std", [0.0, -0.1, float("nan"), [0.1, 0.2], [0.1, -0.1, 0.1]])

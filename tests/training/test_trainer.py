@@ -44,7 +44,11 @@ def pretrained(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "overrides",
-    [[], ["method=scratch"], ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"]],
+    [
+        [],
+        ["method=scratch", "learned_std=true", "training.warmup_batches=2"],
+        ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"],
+    ],
     ids=" ".join,
 )
 def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path, overrides):
@@ -210,3 +214,23 @@ def test_the_shares_of_time_add_up_to_the_whole(pretrained):
 def test_the_learner_runs_on_a_gpu_beside_physics_on_the_cpu(tmp_path):
     experiment.train(configure(tmp_path / "run", "device=cuda"))
     assert all(value.isfinite().all() for value in final_parts(tmp_path / "run").values())
+
+
+@pytest.mark.parametrize(
+    "overrides", [["method=mcp"], ["method=finetune", "task=imitation"], ["method=option_critic"]], ids=" ".join
+)
+def test_in_the_warm_up_normalisers_and_critic_learn_and_the_policy_waits(tmp_path, overrides):
+    settings = [*overrides, "training.warmup_batches=1", "checkpoint_interval=1", "keep_checkpoints=9"]
+    experiment.train(configure(tmp_path, *settings))
+    start, warm, first = (
+        experiment.restore(path, num_envs=1, seed=0)[1].parts.state_dict()
+        for path in sorted((tmp_path / checkpoint.FOLDER).iterdir())[:3]
+    )
+    for name in start:
+        learns_first = name.startswith(("critic", "observation_normaliser", "goal_normaliser"))
+        assert torch.equal(start[name], warm[name]) != learns_first, name
+    assert any(not torch.equal(warm[name], first[name]) for name in warm if not name.startswith("critic"))
+    waiting, *learning = rows(tmp_path)
+    assert float(waiting["loss/kl"]) == pytest.approx(0.0, abs=1e-6)
+    assert float(waiting["loss/actor_grad_norm"]) == 0.0
+    assert all(float(row["loss/actor_grad_norm"]) > 0 for row in learning)

@@ -3,13 +3,17 @@
 from collections.abc import Sequence
 
 import torch
+from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
 
 
 class GaussianPolicy(nn.Module):
-    r"""A network for the mean and a fixed diagonal covariance: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
+    r"""A network for the mean, and a covariance of its own: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
+
+    The standard deviation is the same in all states. The paper's is fixed; learned, the noise can shrink where it is
+    what keeps the policy from its reward.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -17,6 +21,7 @@ class GaussianPolicy(nn.Module):
         action_dim: Size of the action, ``A``.
         num_cells: Hidden units.
         std: Standard deviation, one for all actions or one each, in action units.
+        learned_std: Whether ``std`` is where learning begins, or fixed.
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:
@@ -26,8 +31,6 @@ class GaussianPolicy(nn.Module):
         Peng et al., *MCP*, NeurIPS 2019, Section E.2. https://arxiv.org/abs/1905.09808
     """
 
-    scale: Tensor
-
     def __init__(
         self,
         observation_dim: int,
@@ -36,21 +39,23 @@ class GaussianPolicy(nn.Module):
         *,
         num_cells: Sequence[int] = (1024, 512),
         std: float | Sequence[float] = 0.1,
+        learned_std: bool = False,
         output_gain: float = 0.01,
     ) -> None:
         super().__init__()
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
-        self.register_buffer("scale", fixed_scale(std, action_dim))
+        self.scale = state_independent_scale(std, action_dim, learned_std)
 
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``(*B, A)``, from a state ``(*B, S)`` and a goal ``(*B, G)``."""
-        loc = self.output(self.body(observation, goal))
-        return loc, self.scale.expand_as(loc)
+        return self.scale(self.output(self.body(observation, goal)))
 
 
-def fixed_scale(std: float | Sequence[float], action_dim: int) -> Tensor:
-    """Return standard deviations, shape ``(A,)``, from one for all actions or one each.
+def state_independent_scale(
+    std: float | Sequence[float], action_dim: int, learned: bool
+) -> AddStateIndependentNormalScale:
+    """Return the module that adds standard deviations, from one for all actions or one each, to means ``(*B, A)``.
 
     Raises:
         ValueError: If ``std`` is not positive or is neither one number nor one per action.
@@ -58,4 +63,7 @@ def fixed_scale(std: float | Sequence[float], action_dim: int) -> Tensor:
     scale = torch.as_tensor(std, dtype=torch.float32)
     if scale.numel() not in (1, action_dim) or not (scale > 0).all():
         raise ValueError(f"std must be one positive number or {action_dim} of them, one per action, got {std}")
-    return scale.expand(action_dim).clone()
+    module = AddStateIndependentNormalScale(action_dim, make_param=learned)
+    with torch.no_grad():
+        module.state_independent_scale.copy_(scale.log())
+    return module

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
-from torchrl_mcp.modules.gaussian import fixed_scale
+from torchrl_mcp.modules.gaussian import state_independent_scale
 
 
 class InputInjection(nn.Linear):
@@ -39,6 +38,7 @@ class InjectedPolicy(nn.Module):
         action_dim: Size of the action, ``A``.
         num_cells: Hidden units, two layers or more.
         std: Standard deviation, one for all actions or one each, in action units.
+        learned_std: Whether ``std`` is where learning begins, or fixed.
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:
@@ -48,8 +48,6 @@ class InjectedPolicy(nn.Module):
         Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808
     """
 
-    scale: Tensor
-
     def __init__(
         self,
         observation_dim: int,
@@ -57,17 +55,18 @@ class InjectedPolicy(nn.Module):
         *,
         num_cells: Sequence[int] = (1024, 512),
         std: float | Sequence[float] = 0.1,
+        learned_std: bool = False,
         output_gain: float = 0.01,
     ) -> None:
         super().__init__()
         if len(num_cells) < 2:
             raise ValueError(f"num_cells must name two hidden layers or more, got {list(num_cells)}")
         self.input = nn.Linear(observation_dim, num_cells[0])
+        self.rectifier = nn.ReLU()
         self.body = relu_mlp(num_cells[0], num_cells[1:])
         self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
-        self.register_buffer("scale", fixed_scale(std, action_dim))
+        self.scale = state_independent_scale(std, action_dim, learned_std)
 
     def forward(self, observation: Tensor, injection: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, ``(*B, A)``, from a state ``(*B, S)`` and an injection ``(*B, H)``."""
-        loc = self.output(self.body(torch.relu(self.input(observation) + injection)))
-        return loc, self.scale.expand_as(loc)
+        return self.scale(self.output(self.body(self.rectifier(self.input(observation) + injection))))

@@ -50,6 +50,7 @@ class Primitives(nn.Module):
             raise ValueError(f"initial_std must be positive, got {initial_std}")
         self.trunk = relu_mlp(observation_dim, trunk_cells)
         self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
+        self.rectifier = nn.ReLU() if branch_cells else nn.Identity()
         self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], 2 * action_dim)
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
@@ -60,7 +61,7 @@ class Primitives(nn.Module):
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
         features = self.trunk(observation).unsqueeze(-2)
         if self.branches is not None:
-            features = self.branches(features).relu()
+            features = self.rectifier(self.branches(features))
         loc, log_scale = self.output(features).chunk(2, dim=-1)
         return loc, log_scale.float().exp()
 

@@ -22,6 +22,7 @@ from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.checkpoint import load, run_checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
+from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.episodes import EpisodeStatistics
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Progress, Stopwatch
@@ -59,6 +60,8 @@ class Trainer:
         frames_per_batch: Environment steps per iteration, ``N * T``.
         minibatch_size: Samples per gradient step.
         num_epochs: Passes over each batch.
+        warmup_batches: Batches at the beginning to which normalisers and critic are fitted while the actor waits: its
+            first step is then taken with inputs of unit variance and with advantages that mean something.
         max_grad_norm: Largest gradient norm, of actor and critic each, or None to leave gradients as they are.
         step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
         autocast: Run all networks in bfloat16 autocast, in source and loss alike.
@@ -88,6 +91,7 @@ class Trainer:
         frames_per_batch: int,
         minibatch_size: int,
         num_epochs: int,
+        warmup_batches: int,
         max_grad_norm: float | None,
         step_size_schedule: Callable[[Optimizer], KLAdaptiveLR] | None,
         autocast: bool,
@@ -110,10 +114,12 @@ class Trainer:
         self.frozen, self.metrics_writer, self.checkpoints, self.config = frozen, metrics_writer, checkpoints, config
         self.total_frames, self.frames_per_batch = total_frames, frames_per_batch
         self.minibatch_size, self.num_epochs = minibatch_size, num_epochs
+        self.warmup_batches = warmup_batches
         self.max_grad_norm = math.inf if max_grad_norm is None else max_grad_norm
         self.device, self.autocast = torch.device(device), autocast
         self.checkpoint_interval, self.progress_bar = checkpoint_interval, progress_bar
         self.progress, self.episodes, self.stopwatch = Progress(), EpisodeStatistics(num_envs), Stopwatch()
+        self.dead_units = DeadUnits(parts)
         self.checkpoint: Checkpoint = run_checkpoint(
             parts,
             **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()},
@@ -163,10 +169,14 @@ class Trainer:
                 batch = self.source.collect()
                 metrics = self._episode_metrics(batch) | diagnostics(self.actor, batch)
                 with self.stopwatch("update"):
+                    warming_up = self.progress.iteration < self.warmup_batches
+                    if warming_up:
+                        self._update_normalisers(batch)
                     with self._precision():
                         samples = self.advantages(batch)
-                    metrics |= self._update(samples)
-                self._update_normalisers(batch)
+                    metrics |= self._update(samples, warming_up)
+                if not warming_up:
+                    self._update_normalisers(batch)
                 self.frozen.verify()
                 self._advance(metrics, time.perf_counter() - start)
                 bar.set_postfix_str(self._summary(metrics), refresh=False)
@@ -178,13 +188,18 @@ class Trainer:
         keys = [key for key in dict.fromkeys(self.actor.policy.out_keys) if key in kept]
         return TensorDictSequential(self.actor.policy, selected_out_keys=keys)
 
-    def _update(self, samples: TensorDictBase) -> dict[str, float]:
-        """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports."""
+    def _update(self, samples: TensorDictBase, warming_up: bool) -> dict[str, float]:
+        """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports.
+
+        While ``warming_up`` the actor waits, and reports its loss alone.
+        """
         keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
         samples = samples.select(*keys, *self.advantages.out_keys).flatten()
         orders = [torch.randperm(samples.shape[0], device=samples.device) for _ in range(self.num_epochs)]
         minibatches = [index for order in orders for index in order.split(self.minibatch_size)]
         learning = {name: partial(self._learn, name, samples, minibatches) for name in self.optimizers}
+        if warming_up and "actor" in learning:
+            learning["actor"] = partial(self._wait, samples[minibatches[0]])
         # Actor and critic share nothing but samples: on a CPU they learn at the same time.
         reports = side_by_side(learning) if self.device.type == "cpu" else {name: f() for name, f in learning.items()}
         metrics = {f"loss/{key}": value for report in reports.values() for key, value in _mean(report).items()}
@@ -193,13 +208,22 @@ class Trainer:
             # The low-variance estimate of Schulman, "Approximating KL divergence", 2020: E[(r - 1) - log r].
             metrics["loss/kl"] = last["mean_ratio"] - 1 + last["kl_approx"]
         self._require_finite(metrics)
-        if self.schedule:
+        if self.schedule and not warming_up:
             self.schedule.step(metrics["loss/kl"])
         if "actor" in self.optimizers:
             metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
-        with torch.no_grad(), self._precision():
-            distribution = self.actor.trained.get_dist(samples[: self.minibatch_size])
-        return metrics | _spread(distribution)
+        return metrics | self._networks(samples[: self.minibatch_size])
+
+    def _networks(self, samples: TensorDictBase) -> dict[str, float]:
+        """Tell how much the policy explores and how many units of the networks are dead, by samples ``(B,)``."""
+        metrics: dict[str, float] = {}
+
+        def evaluate() -> None:
+            metrics.update(_spread(self.actor.trained.get_dist(samples)))
+            self.critic(samples.select("observation", "goal"))
+
+        with self._precision():
+            return self.dead_units(evaluate) | metrics
 
     def _learn(self, name: str, samples: TensorDictBase, minibatches: Sequence[Tensor]) -> list[TensorDictBase]:
         """Take a gradient step of the optimiser of that name on every minibatch; give what its loss reports."""
@@ -210,6 +234,15 @@ class Trainer:
             sum(value for key, value in report.items() if key.startswith("loss_")).backward()
             reports.append(report.detach().set(f"{name}_grad_norm", self._step(self.optimizers[name])))
         return reports
+
+    @torch.no_grad()
+    def _wait(self, samples: TensorDictBase) -> list[TensorDictBase]:
+        """Give what the actor's loss reports of samples that a policy with the normalisers of now would have drawn."""
+        with self._precision():
+            distribution = self.actor.trained.get_dist(samples)
+            samples[self.actor.log_prob] = distribution.log_prob(samples[self.actor.sampled])
+            report = self.losses["actor"](samples)
+        return [report.set("actor_grad_norm", torch.zeros((), device=self.device))]
 
     def _step(self, optimizer: Optimizer) -> Tensor:
         """Clip the gradient, step, and give the norm that it had."""
@@ -228,7 +261,7 @@ class Trainer:
                 )
 
     def _update_normalisers(self, batch: TensorDictBase) -> None:
-        """Merge the batch into the input statistics, after the update so that source and loss saw the same."""
+        """Merge the batch into the input statistics, after the actor's update: source and loss have to see the same."""
         for key in ("observation", "goal"):
             if (name := f"{key}_normaliser") not in self.frozen:
                 cast("RunningNormaliser", self.parts[name]).update(batch[key])

@@ -1,0 +1,69 @@
+"""Hidden units that no input activates any more, so that no gradient reaches them."""
+
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+TOO_MANY = 0.2
+"""Share of dead units in a hidden layer from which on the trainer warns."""
+
+MIN_SAMPLES = 64
+"""Samples from which on units are judged: an option that hardly acts has seen too few."""
+
+
+class DeadUnits:
+    """A watch over the hidden layers of networks: a unit is dead that is zero for all samples of an evaluation.
+
+    Args:
+        networks: Networks by name, whose hidden layers end in :class:`torch.nn.ReLU`.
+    """
+
+    def __init__(self, networks: nn.ModuleDict) -> None:
+        self.layers = {name: layer for name, layer in networks.named_modules() if isinstance(layer, nn.ReLU)}
+        self._warned: set[str] = set()
+
+    @torch.no_grad()
+    def __call__(self, evaluate: Callable[[], Any]) -> dict[str, float]:
+        """Return the share of dead units in the worst hidden layer of each network that ``evaluate`` runs.
+
+        A layer is named once in a warning when its share passes :data:`TOO_MANY`.
+
+        Args:
+            evaluate: Evaluates networks on samples of one batch dimension.
+
+        Returns:
+            Shares as ``dead_units/<network>``, 0 where all layers saw less than :data:`MIN_SAMPLES`.
+        """
+        shares: dict[str, Tensor] = {}
+        with ExitStack() as hooks:
+            for name, layer in self.layers.items():
+                handle = layer.register_forward_hook(partial(_record, shares, name))
+                hooks.callback(handle.remove)
+            evaluate()
+        worst: dict[str, float] = {}
+        for name, share in zip(shares, torch.stack([*shares.values()]).tolist(), strict=True):
+            key = f"dead_units/{name.partition('.')[0]}"
+            worst[key] = max(worst.get(key, 0.0), share)
+            self._warn(name, share)
+        return worst
+
+    def _warn(self, layer: str, share: float) -> None:
+        if share <= TOO_MANY or layer in self._warned:
+            return
+        self._warned.add(layer)
+        warnings.warn(
+            f"{share:.0%} of the hidden units of {layer} are zero for all samples and learn no more: "
+            "take smaller steps (optimizer.schedule.max_lr), or larger initial weights of the output (output_gain)",
+            stacklevel=2,
+        )
+
+
+def _record(shares: dict[str, Tensor], name: str, layer: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:
+    """Note under ``name`` the share of the units of ``output``, ``(B, ...)``, that are zero in all of B samples."""
+    judged = len(output) >= MIN_SAMPLES
+    shares[name] = (output <= 0).all(0).float().mean() if judged else output.new_zeros((), dtype=torch.float32)
