@@ -13,7 +13,8 @@ from types import SimpleNamespace
 import pytest
 from matplotlib.image import imread
 
-from torchrl_mcp.cli import demo
+from torchrl_mcp.cli import demo as command
+from torchrl_mcp.cli import demonstration as demo
 from torchrl_mcp.runs import experiment
 
 FILES = [
@@ -134,7 +135,7 @@ def test_the_full_budget_gives_scratch_as_many_steps_as_pretraining_and_transfer
 def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, override):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-demo", "--output", str(tmp_path / "demo"), override])
     with pytest.raises(SystemExit, match=override.partition("=")[0]):
-        demo.main()
+        command.main()
     assert not (tmp_path / "demo").exists()
 
 

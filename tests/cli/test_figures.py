@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from torchrl_mcp.cli import figures
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.runs import build
-from torchrl_mcp.runs.builtin import publish
+from torchrl_mcp.runs.publish import publish
 
 ANT = ["task=holdout", "task.pretrain.max_episode_steps=6"]
 BIPED = ["task=imitation", "character=biped"]
@@ -169,7 +169,7 @@ def test_holdout_draws_trajectories_by_direction_and_curves(runs, tmp_path, monk
         ("primitives", ["ant"], "task=holdout: Figure 7 is of pre-training"),
         ("holdout", ["mcp"], "task=imitation: Figure 5 is of task=holdout"),
         ("exploration", ["mcp", "mcp"], "a checkpoint is named twice"),
-        ("exploration", ["nothing"], "neither a checkpoint file nor a run folder"),
+        ("exploration", ["nothing"], "there is no nothing: give a run folder"),
         ("exploration", ["builtin:horse"], "no network for method=mcp and character=horse"),
     ],
 )

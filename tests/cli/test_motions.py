@@ -8,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchrl_mcp.cli import motions
+from torchrl_mcp.cli import motion_files, motions
+from torchrl_mcp.envs.motions.capture.build import HUMANS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk
@@ -130,7 +131,7 @@ def test_a_motion_whose_feet_slide_is_pointed_out(run, tmp_path):
 def corpus(folder, **seconds):
     """The files of the paper's corpus, in which nobody moves a limb."""
     (folder / "deep").mkdir(parents=True)
-    for name, duration in {**motions.PAPER_CORPUS, **seconds}.items():
+    for name, duration in {**motion_files.PAPER_CORPUS, **seconds}.items():
         if name.endswith(".txt"):
             loop = "wrap" if name == "humanoid3d_walk.txt" else "none"
             (folder / "deep" / name).write_text(motion(duration, loop, speed=0.1))
@@ -173,7 +174,7 @@ def test_the_papers_corpus_of_real_files_is_230_seconds_and_half_of_it_is_mirror
 WRONG = {
     "no command": ([], "required: command"),
     "no file": (["import"], "required: FILE"),
-    "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: nowhere.bvh: cannot be read"),
+    "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: there is no nowhere.bvh"),
     "missing clip": (["inspect", "nowhere.npz"], "torchrl-mcp-motions: .*nowhere.npz"),
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
     "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
@@ -192,12 +193,18 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     (tmp_path / "broken.bvh").write_text("nothing")
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
     (tmp_path / "notes.md").write_text("nothing")
-    (tmp_path / "stand.txt").write_text(motion(1.0))
+    (tmp_path / "more").mkdir()
+    for path in (tmp_path / "stand.txt", tmp_path / "more" / "stand.txt"):
+        path.write_text(motion(1.0))
     status, output, errors = run(*words)
     assert status == 2
     assert output == ""
     assert re.search(message, errors)
     assert "Traceback" not in errors
+
+
+def test_the_characters_that_the_command_line_offers_are_those_with_a_human_body():
+    assert motions.HUMANS == HUMANS
 
 
 def test_help_shows_examples():

@@ -5,7 +5,8 @@ import pytest
 from hydra import compose, initialize_config_module
 
 import torchrl_mcp.conf
-from torchrl_mcp.cli.train import main, suggestions
+from torchrl_mcp.cli.suggestions import suggestions
+from torchrl_mcp.cli.train import main
 from torchrl_mcp.runs import benchmark
 
 CONF = Path(torchrl_mcp.conf.__file__).parent

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from torchrl_mcp.cli.report import report
+from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")

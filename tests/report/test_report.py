@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from torchrl_mcp.cli.report import main, report
+from torchrl_mcp.cli.report import main
+from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
 
 MOMENT = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
@@ -272,5 +273,11 @@ def test_the_command_writes_both_files(runs, tmp_path, monkeypatch, capsys):
 
 def test_the_command_tells_what_is_wrong_with_its_arguments(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(tmp_path / "nowhere")])
-    with pytest.raises(SystemExit, match=r"torchrl-mcp-report: .*nowhere holds no run: give folders"):
+    with pytest.raises(SystemExit, match=r"torchrl-mcp-report: there is no folder .*nowhere"):
+        main()
+
+
+def test_the_command_tells_that_a_folder_holds_no_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(tmp_path)])
+    with pytest.raises(SystemExit, match="holds no run: give folders"):
         main()

@@ -1,293 +1,43 @@
-"""``torchrl-mcp-demo``: pre-train primitives, transfer them to directions never seen, and compare with scratch.
-
-Two processes work side by side, one for MCP and one for scratch, which gets as many steps as MCP's pre-training and
-transfer together. Everything lands in one folder, and what is there already is not done again.
-"""
+"""``torchrl-mcp-demo``: pre-train primitives, transfer them to directions never seen, and compare with scratch."""
 
 import argparse
-import json
-import math
 import sys
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import cast
 
-import torch
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
+from torchrl_mcp.cli.parsing import announce, new_parser
 
-from torchrl_mcp import __version__, analysis
-from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.runs.identity import PLACES, differences
-from torchrl_mcp.runs.processes import start, ticks
-from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training.checkpoint import FOLDER
-from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
-from torchrl_mcp.viewer.film import save_film
-
-Runs = Mapping[str, DictConfig]
-
-RUNS = {
-    "pretrain": ["method=mcp", "stage=pretrain"],
-    "transfer": ["method=mcp", "stage=transfer"],
-    "scratch": ["method=scratch", "stage=transfer", "+parts.policy.num_cells=[512,256]"],
-}
-
-# Panels of the picture: title, run, and stage whose directions the ant is told to take.
-PANELS = {
-    "seen": ("pre-training directions,\nas pre-trained", "pretrain", "pretrain"),
-    "before": ("held-out directions,\nas pre-trained", "pretrain", "transfer"),
-    "after": ("held-out directions,\nafter transfer", "transfer", "transfer"),
-}
-SPACING = math.radians(15)
-
-FILM = "film.gif"
-CONTENTS = """\
-  results.md, results.json           the table, and all its numbers
-  learning_curves.png, .svg, .csv    learning on the held-out directions
-  trajectories.png, .svg             where the ant went, by target direction
-  pretrain/, transfer/, scratch/     run folders: torchrl-mcp-evaluate {folder}/transfer"""
-
-
-@dataclass(frozen=True)
-class Policy:
-    """A policy in the table of results.
-
-    Attributes:
-        label: What the table calls it.
-        path: Run folder or checkpoint file.
-        steps: Environment steps of training on the held-out directions.
-        pretraining_steps: Environment steps of training on others before.
-    """
-
-    label: str
-    path: Path
-    steps: int
-    pretraining_steps: int = 0
+PROGRAM = "torchrl-mcp-demo"
 
 
 def main() -> None:
     """Run the demonstration, or what is left of it."""
-    parser = argparse.ArgumentParser(prog="torchrl-mcp-demo", description=__doc__.partition("\n")[0])
-    parser.add_argument("overrides", nargs="*", help="settings of all runs, as torchrl-mcp-train takes them: seed=1")
-    parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
-    parser.add_argument("--smoke", action="store_true", help="a test of the demonstration, which takes seconds")
-    arguments = parser.parse_args()
+    arguments = parser().parse_args()
+    announce(PROGRAM)
+    from hydra.errors import HydraException
+
+    from torchrl_mcp.cli.demonstration import run
+
     preset = "demo_smoke" if arguments.smoke else "demo"
     try:
         run(arguments.output, [f"preset={preset}", *arguments.overrides])
     except (HydraException, ValueError) as error:
-        sys.exit(f"torchrl-mcp-demo: {error}")
+        sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
-        sys.exit("\ntorchrl-mcp-demo: interrupted; call it again to go on from here")
+        sys.exit(f"\n{PROGRAM}: interrupted; call it again to go on from here")
 
 
-def run(folder: Path, overrides: Sequence[str]) -> None:
-    """Train, evaluate and report in ``folder``, save what it holds already.
-
-    Raises:
-        ValueError: If the settings contradict each other or those of the folder, or a process fails.
-    """
-    began = time.monotonic()
-    runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
-    runs["transfer"].pretrained = runs["pretrain"].run_dir
-    require_early_checkpoint(runs)
-    settings = runs["pretrain"].demo
-    print(f"This takes about {settings.minutes} minutes on two cores. Everything lands in {folder}.")
-    print("Interrupt it when you like: called again, it goes on from there.", flush=True)
-    show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
-    print("\n" + report(folder, runs))
-    filmed = film(folder, settings.film.seconds)
-    print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes everything is in {folder}:")
-    print(f"{CONTENTS.format(folder=folder)}\n{filmed}")
-
-
-def film(folder: Path, seconds: float) -> str:
-    """Film the ant after transfer, unless there is a film, and return what the contents say of it."""
-    path = folder / FILM
-    _, agent, env = experiment.restore(folder / "transfer", num_envs=1, seed=0)
-    try:
-        if not path.exists():
-            save_film(agent.actor.policy, env, path, seconds=seconds)
-    except RuntimeError as error:
-        return f"  no film: {error}"
-    return f"  {FILM:35}the ant runs in held-out directions"
-
-
-def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
-    """Return the configuration of the run in ``folder``.
-
-    Raises:
-        ValueError: If the folder holds a run with another one.
-    """
-    cfg = build.compose_run(*overrides)
-    cfg.run_dir = str(folder)
-    if not (folder / CONFIG).exists():
-        return cfg
-    held = experiment.run_config(folder)
-    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, cfg))
-    if differences(began, begins, PLACES):
-        raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
-    cfg.autocast = held.autocast  # the precision that the run chose
-    return cfg
-
-
-def require_early_checkpoint(runs: Runs) -> None:
-    """Check that scratch writes a checkpoint after as many steps as transfer takes."""
-    steps, scratch = _steps(runs["transfer"]), runs["scratch"]
-    between = scratch.checkpoint_interval * scratch.training.frames_per_batch
-    if steps % between and steps != _steps(scratch):
-        raise ValueError(
-            f"transfer ends after {steps} steps, and scratch has no checkpoint there to compare with, only one every "
-            f"{between}: make budget.transfer a multiple of that, or checkpoint_interval smaller"
-        )
-
-
-def policies(folder: Path, runs: Runs) -> dict[str, Policy]:
-    """Return the lines of the table."""
-    pretraining, transfer, scratch = (_steps(runs[name]) for name in RUNS)
-    early = folder / "scratch" / FOLDER / f"checkpoint-{transfer:012d}.torchrl"
-    return {
-        "before": Policy("MCP before transfer", folder / "pretrain", 0, pretraining),
-        "after": Policy("MCP after transfer", folder / "transfer", transfer, pretraining),
-        "scratch_early": Policy("scratch", early, transfer),
-        "scratch": Policy("scratch", folder / "scratch", scratch),
-    }
-
-
-def learn_and_transfer(folder: Path, runs: Runs) -> None:
-    """Pre-train MCP, transfer it, evaluate it before and after, and record where it goes."""
-    train(runs["pretrain"])
-    train(runs["transfer"])
-    for name in ("before", "after"):
-        evaluate(folder, runs, name)
-    for name in PANELS:
-        record_trajectories(folder, runs, name)
-
-
-def learn_from_scratch(folder: Path, runs: Runs) -> None:
-    """Train scratch on the held-out directions, and evaluate it."""
-    train(runs["scratch"])
-    for name in ("scratch_early", "scratch"):
-        evaluate(folder, runs, name)
-
-
-def train(cfg: DictConfig) -> None:
-    """Train as configured, or go on where training stopped."""
-    folder = Path(cfg.run_dir)
-    if (folder / CONFIG).exists():
-        experiment.resume(folder)
-    else:
-        experiment.train(cfg)
-
-
-def evaluate(folder: Path, runs: Runs, name: str) -> None:
-    """Evaluate one of the :func:`policies` on the held-out directions."""
-    file, cfg = evaluation_file(folder, name), runs["transfer"]
-    if file.exists():
-        return
-    path, directions = policies(folder, runs)[name].path, cfg.task.directions.transfer
-    results = experiment.evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
-    write_json(results, file)
-
-
-def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
-    """Play the episodes of one of the ``PANELS``."""
-    file, (_, run_name, stage) = trajectory_file(folder, name), PANELS[name]
-    if file.exists():
-        return
-    cfg = runs[run_name]
-    low, high = cfg.task.directions[stage]
-    grid = torch.linspace(low, high, round((high - low) / SPACING) + 1)
-    directions = grid.repeat_interleave(cfg.demo.paths.per_direction)
-    _, agent, env = experiment.restore(
-        Path(cfg.run_dir), num_envs=len(directions), seed=cfg.demo.seed, max_episode_steps=cfg.demo.paths.steps
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Pre-train primitives, transfer them to directions never seen, compare with scratch.")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="SETTING=VALUE",
+        help="settings of all runs, as torchrl-mcp-train takes them: seed=1",
     )
-    with replacing(file) as partial:
-        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), partial)
-
-
-def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
-    """Show how far training and evaluation are, until both are done."""
-    files = [evaluation_file(folder, name) for name in policies(folder, runs)]
-    files += [trajectory_file(folder, name) for name in PANELS]
-    totals = {name: _steps(cfg) for name, cfg in runs.items()}
-    interval = 1.0 if sys.stderr.isatty() else 15.0
-    form = "{desc} {percentage:3.0f}% |{bar:8}|"
-    with (
-        tqdm(desc="evaluation", total=len(files), bar_format=form, position=1) as evaluation,
-        tqdm(
-            desc="training  ",
-            total=sum(totals.values()),
-            bar_format=form + " {elapsed}<{remaining}{postfix}",
-            position=0,
-        ) as training,
-    ):
-        for _ in ticks(processes, interval):
-            rows = {name: analysis.read_metrics(folder / name) for name in runs}
-            done = {name: table[-1]["frames"] if table else 0.0 for name, table in rows.items()}
-            training.n, evaluation.n = sum(done.values()), sum(file.exists() for file in files)
-            training.set_postfix_str(", ".join(f"{name} {done[name] / totals[name]:.0%}" for name in runs))
-            evaluation.refresh()
-
-
-def report(folder: Path, runs: Runs) -> str:
-    """Write table and figures, and return the table."""
-    cfg, lines = runs["transfer"], policies(folder, runs)
-    results = {name: json.loads(evaluation_file(folder, name).read_text()) for name in lines}
-    low, high = (math.degrees(angle) for angle in cfg.task.directions.transfer)
-    table = _table(lines, results) + (
-        f"\n\nNormalised return on directions from {low:.0f} to {high:.0f} degrees: mean of {cfg.demo.episodes} "
-        "episodes and its 95 % interval. Steps are those of training on these directions, steps before those of "
-        f"pre-training on the others. Seed {cfg.seed}, torchrl-mcp {__version__}."
-    )
-    details = {
-        name: {"label": line.label, "steps": line.steps, "pretraining_steps": line.pretraining_steps, **results[name]}
-        for name, line in lines.items()
-    }
-    with replacing(folder / "results.md") as partial:
-        partial.write_text(table + "\n")
-    write_json(details, folder / "results.json")
-    groups = {"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]}
-    curves = analysis.learning_curves(groups, num_bins=20)
-    analysis.write_curves(curves, folder / "learning_curves.csv")
-    figure = analysis.draw_curves(curves, xlabel="environment steps on the held-out directions")
-    analysis.save_figure(figure, folder / "learning_curves")
-    panels = {PANELS[name][0]: analysis.load_trajectories(trajectory_file(folder, name)) for name in PANELS}
-    analysis.save_figure(analysis.draw_trajectories(panels), folder / "trajectories")
-    return table
-
-
-def evaluation_file(folder: Path, name: str) -> Path:
-    """Return where the evaluation of one of the :func:`policies` is kept."""
-    return folder / "evaluation" / f"{name}.json"
-
-
-def trajectory_file(folder: Path, name: str) -> Path:
-    """Return where the episodes of one of the ``PANELS`` are kept."""
-    return folder / "trajectories" / f"{name}.npz"
-
-
-def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]]) -> str:
-    """Return Markdown whose columns line up in a terminal."""
-    rows = []
-    for name, line in lines.items():
-        scores = {
-            mode: f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
-            for mode, numbers in results[name].items()
-        }
-        steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
-        rows.append({"policy": line.label, **steps, **scores})
-    return text_table(rows, markdown=True)
-
-
-def _steps(cfg: DictConfig) -> int:
-    """Environment steps of a run, which ends with a whole batch."""
-    return math.ceil(cfg.training.total_frames / cfg.training.frames_per_batch) * cfg.training.frames_per_batch
+    parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
+    parser.add_argument("--smoke", action="store_true", help="a test of the demonstration, which takes seconds")
+    return parser
 
 
 if __name__ == "__main__":

@@ -6,35 +6,38 @@ With ``--output RUN/evaluation.json`` it leaves in a run folder what training en
 import argparse
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from torchrl_mcp.evaluation.diagnostics import COLLAPSED
+from torchrl_mcp.cli.parsing import announce, new_parser
 from torchrl_mcp.runs.builtin import locate
-from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
-from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import write_json
+
+PROGRAM = "torchrl-mcp-evaluate"
 
 
 def main() -> None:
     """Play one episode in each of many environments and print the statistics."""
-    parser = argparse.ArgumentParser(prog="torchrl-mcp-evaluate", description=__doc__.partition("\n")[0])
-    parser.add_argument(
-        "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
-    )
-    parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
-    parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
-    parser.add_argument(
-        "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
-    )
-    parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
-    arguments = parser.parse_args()
+    arguments = parser().parse_args()
     try:
         path = locate(arguments.checkpoint)
+        announce(PROGRAM)
+        from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+
         clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
         results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
     except ValueError as error:
-        sys.exit(f"torchrl-mcp-evaluate: {error}")
+        sys.exit(f"{PROGRAM}: {error}")
+    report(arguments, results, [asdict(clip) for clip in clips])
+
+
+def report(arguments: argparse.Namespace, results: Mapping[str, Any], clips: Sequence[Mapping[str, object]]) -> None:
+    """Print the statistics, and write them to a file if wanted."""
+    from torchrl_mcp.evaluation.diagnostics import COLLAPSED
+    from torchrl_mcp.runs.tables import text_table
+
     print(f"{arguments.checkpoint}: {arguments.episodes} episodes, seed {arguments.seed}")
     for mode in ("deterministic", "stochastic"):
         numbers = results[mode]
@@ -50,10 +53,25 @@ def main() -> None:
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
             print("the options have collapsed: one of them acts almost always")
     if clips:
-        print(text_table([asdict(clip) for clip in clips]))
+        print(text_table(clips))
     if arguments.output:
-        numbers = results | ({"clips": [asdict(clip) for clip in clips]} if clips else {})
+        numbers = results | ({"clips": clips} if clips else {})
         write_json(numbers, arguments.output)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Play episodes with a trained policy: returns, and diagnostics of gates and options.")
+    parser.add_argument(
+        "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
+    )
+    parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
+    parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
+    parser.add_argument(
+        "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
+    )
+    parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
+    return parser
 
 
 if __name__ == "__main__":

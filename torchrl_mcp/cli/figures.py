@@ -1,28 +1,11 @@
 """``torchrl-mcp-figures``: the paper's Figures 5, 6 and 7 from trained networks, as PNG and SVG, their data as CSV."""
 
 import argparse
-import csv
-import math
 import sys
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import torch
-from matplotlib.figure import Figure
-from omegaconf import DictConfig
-from torch import nn
-
-from torchrl_mcp.analysis import checkpoints, exploration
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
-from torchrl_mcp.analysis.exploration import Exploration
-from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories
-from torchrl_mcp.analysis.walk_cycle import draw_walk_cycle
-from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, specialisation
-from torchrl_mcp.report.paper import CHARACTERS
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.cli.parsing import announce, new_parser
 from torchrl_mcp.runs.builtin import PREFIX, locate
-from torchrl_mcp.runs.tables import text_table
 
 PROGRAM = "torchrl-mcp-figures"
 
@@ -36,157 +19,24 @@ examples:
   {PROGRAM} primitives {PREFIX}biped {PREFIX}humanoid          # Figure 7
 """
 
-PAPER = """\
-The paper (section 5.4) gives no numbers. It reports that weights "show a strong correlation to the phase of a walk
-cycle", with a primitive for the left stance and one for the right, in all runs, and that mean actions "form distinct
-clusters". Compare with the untrained networks: gates see state and reference, which have a phase of their own."""
-
 
 def main() -> None:
     """Do what the command line says."""
-    arguments = _parser().parse_args()
+    arguments = parser().parse_args()
     try:
         arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
-        arguments.run(arguments)
+        announce(PROGRAM)
+        from torchrl_mcp.cli import paper_figures
+
+        getattr(paper_figures, arguments.draw)(arguments)
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
 
 
-def holdout(arguments: argparse.Namespace) -> None:
-    """Draw Figure 5: learning curves on the held-out directions, and trajectories by target direction."""
-    runs: dict[str, dict[str, list[Path]]] = {}
-    for path in arguments.checkpoints:
-        cfg = experiment.policy_config(path)
-        if cfg.task.name != "holdout":
-            raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that")
-        runs.setdefault(_label(cfg), {}).setdefault(cfg.stage.name, []).append(path)
-    for label, stages in runs.items():
-        panels: dict[str, Trajectories] = {}
-        for stage in sorted(stages):
-            panels |= checkpoints.trajectories(stages[stage][0], seed=arguments.seed)
-        stem = arguments.output / f"holdout_{label.lower().replace(' ', '_').replace('-', '_')}"
-        _save(draw_trajectories({f"{label} {name}": panel for name, panel in panels.items()}), stem)
-        _write([row for name, panel in panels.items() for row in _ray_rows(name, panel)], stem)
-    if transfers := {label: stages["transfer"] for label, stages in runs.items() if "transfer" in stages}:
-        curves = learning_curves(transfers)
-        _save(draw_curves(curves), arguments.output / "holdout_curves")
-        write_curves(curves, arguments.output / "holdout_curves.csv")
-
-
-def explore(arguments: argparse.Namespace) -> None:
-    """Draw Figure 6: where a character goes that explores at random, by method."""
-    panels, character = _explored(arguments)
-    stem = arguments.output / f"exploration_{character}"
-    title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
-    _save(exploration.draw_exploration(panels, title=title), stem)
-    _write([{"panel": name, **row} for name, panel in panels.items() for row in exploration.path_rows(panel)], stem)
-    numbers = [{"panel": name, **exploration.path_statistics(panel)} for name, panel in panels.items()]
-    _write(numbers, stem, "summary")
-    print(text_table(numbers))
-
-
-def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], str]:
-    """Exploration by its name, that of every checkpoint and that of noise, and the character that explored."""
-    runs = [(name, *experiment.restore(path, num_envs=1, seed=0)[:2]) for name, path in _named(arguments.checkpoints)]
-    first = runs[0][1]
-    if others := {cfg.character.name for _, cfg, _ in runs} - {first.character.name}:
-        given = f"{first.character.name} and {', '.join(others)}"
-        raise ValueError(f"checkpoints are of {given}: give those of one character")
-    num, seed, std = arguments.trajectories, arguments.seed, first.character.action_std
-    env, start = checkpoints.ground(first, num, seconds=arguments.seconds, seed=seed)
-    panels: dict[str, Exploration] = {}
-    for name, cfg, agent in runs:
-        explorer = checkpoints.explorer(cfg, agent, num, torch.Generator().manual_seed(seed))
-        label = checkpoints.explorer_title(cfg)
-        label = f"{label} ({name})" if label in panels else label
-        panels[label] = exploration.explore(explorer, agent.parts["observation_normaliser"], env, start)
-    generator = torch.Generator().manual_seed(seed)
-    noise = exploration.action_noise(env.action_spec.shape[-1], std=std, generator=generator)
-    panels[f"no primitives, noise of std {std:g}"] = exploration.explore(noise, nn.Identity(), env, start)
-    return panels, first.character.name
-
-
-def analyse(arguments: argparse.Namespace) -> None:
-    """Draw Figure 7: weights over the walk cycle and mean actions of primitives, and say how far they specialise."""
-    rows = []
-    for name, path in _named(arguments.checkpoints):
-        cfg = experiment.policy_config(path)
-        walk, untrained = checkpoints.walk_of(
-            path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
-        )
-        stem = arguments.output / f"primitives_{name}"
-        title = f"{cfg.method.title}, {CHARACTERS[cfg.character.name]}"
-        title += f", walking {arguments.clip or 'straight ahead'}"
-        _save(draw_walk_cycle(walk, untrained, title=title), stem)
-        _write(cycle_rows(walk), stem, "weights")
-        _write(action_rows(walk), stem, "actions")
-        _write(primitive_rows(walk), stem)
-        shared = {"checkpoint": name, "character": cfg.character.name, "seed": cfg.seed, "strides": walk.strides}
-        rows += [
-            {**shared, "networks": networks, **numbers}
-            for networks, numbers in (("trained", specialisation(walk)), ("untrained", untrained))
-        ]
-    _write(rows, arguments.output / "primitives")
-    print(f"{text_table(rows)}\n{PAPER}")
-
-
-def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
-    return [
-        {
-            "panel": " ".join(name.split()),
-            "direction": round(direction, 4),
-            "step": step,
-            "x": round(x, 3),
-            "y": round(y, 3),
-        }
-        for direction, path in zip(panel.directions.tolist(), panel.positions.swapaxes(0, 1).tolist(), strict=True)
-        for step, (x, y) in enumerate(path, start=1)
-        if step % 4 == 0 and math.isfinite(x)
-    ]
-
-
-def _label(cfg: DictConfig) -> str:
-    """Title of a method, with its mixer and exploration if they are not its standard."""
-    details = []
-    if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
-        details.append(cfg.mixer.name)
-    if cfg.stage.name == "transfer" and cfg.get("exploration", {}).get("name") == "weights":
-        details.append("over weights")
-    return " ".join([cfg.method.title, *details])
-
-
-def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Paths with names for files: as much of their ends as tells them apart."""
-    whole = [path.resolve().with_suffix("") if path.is_file() else path.resolve() for path in paths]
-    for depth in range(1, max(len(path.parts) for path in whole) + 1):
-        names = ["-".join(path.parts[-depth:]) for path in whole]
-        if len(set(names)) == len(names):
-            return list(zip(names, paths, strict=True))
-    raise ValueError("a checkpoint is named twice: give each once")
-
-
-def _save(figure: Figure, stem: Path) -> None:
-    for path in save_figure(figure, stem):
-        print(path)
-
-
-def _write(rows: Sequence[Mapping[str, object]], stem: Path, part: str = "") -> None:
-    path = stem.with_name(f"{stem.name}{part and '_'}{part}.csv")
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{x:.5g}" if isinstance(x, float) else x for key, x in row.items()})
-    print(path)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Draw the paper's Figures 5, 6 and 7 from trained networks, as PNG and SVG, their data as CSV.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    description = "Draw the paper's Figures 5, 6 and 7 from trained networks, as PNG and SVG, their data as CSV."
+    parser = new_parser(PROGRAM, description, EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT")
@@ -194,16 +44,16 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_argument("--seed", type=int, default=0, help="of environments and of what is random (default 0)")
 
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")
-    command.set_defaults(run=holdout)
+    command.set_defaults(draw="holdout")
     command = commands.add_parser("exploration", parents=[shared], help="Figure 6: where random combinations lead")
     command.add_argument("--trajectories", type=int, default=48, metavar="N", help="of each method (default 48)")
     command.add_argument("--seconds", type=float, default=10.0, help="of each at most (default 10)")
-    command.set_defaults(run=explore)
+    command.set_defaults(draw="explore")
     command = commands.add_parser("primitives", parents=[shared], help="Figure 7: weights over the walk cycle, actions")
     command.add_argument("--clip", help="generated motion to follow, such as left_sharp (default straight ahead)")
     command.add_argument("--walkers", type=int, default=8, metavar="N", help="side by side (default 8)")
     command.add_argument("--seconds", type=float, default=10.0, help="of each (default 10)")
-    command.set_defaults(run=analyse)
+    command.set_defaults(draw="analyse")
     return parser
 
 

@@ -1,24 +1,16 @@
 """``torchrl-mcp-motions``: import motion capture, look at it, and rebuild the paper's corpus."""
 
 import argparse
-import math
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torch import Tensor
-
-from torchrl_mcp.envs.motions import MotionClip
-from torchrl_mcp.envs.motions.capture.build import HUMANS
-from torchrl_mcp.envs.motions.capture.importer import Import, imported
-from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
-from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
-from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
-from torchrl_mcp.envs.motions.inspection.summary import Summary, summarised
-from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.cli.parsing import new_parser
 
 PROGRAM = "torchrl-mcp-motions"
+
+HUMANS = ("humanoid", "biped")
+"""Characters with a human body: ``torchrl_mcp.envs.motions.capture.build.HUMANS``, which takes seconds to import."""
 
 EXAMPLES = f"""\
 Files are BVH (.bvh), Acclaim (.amc, beside its .asf), DeepMimic (.json, .txt), or clips that this program wrote (.npz).
@@ -31,201 +23,34 @@ examples:
   {PROGRAM} build-paper-corpus downloads --output corpus
 """
 
-PAPER_CORPUS = {
-    "humanoid3d_long_walk1.txt": 32.79,
-    "humanoid3d_long_walk2.txt": 24.56,
-    "humanoid3d_long_walk3.txt": 17.74,
-    "0005_Walking001.bvh": 39.09,
-    "humanoid3d_walk.txt": 1.27,
-}
-"""Seconds of each file. With mirror images of all but the last, which loops, they make the 230 s of appendix C."""
-
-SOURCES = {
-    ".txt": "https://github.com/xbpeng/DeepMimic, data/motions",
-    ".bvh": "https://mocap.cs.sfu.ca, subject 0005, Walking001",
-}
-
-COLUMNS = (
-    "clip",
-    "character",
-    "seconds",
-    "frames/s",
-    "m/s",
-    "|rad/s|",
-    "slide m/s",
-    "beyond limits",
-    "below ground",
-    "legs in legs",
-    "torque/limit",
-    "rest pose leans",
-)
-"""Of the table, from ``summary`` and ``feasibility`` of ``torchrl_mcp.envs.motions.inspection``."""
-
-STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
-    "length m": lambda strides: strides.stride_length,
-    "steps/min": lambda strides: strides.cadence,
-    "width m": lambda strides: strides.step_width,
-    "stance": lambda strides: strides.stance,
-    "double support": lambda strides: strides.double_support,
-    "bob m": lambda strides: strides.bob,
-    "sway m": lambda strides: strides.sway,
-    "knee swing deg": lambda strides: strides.knee_swing,
-    "foot strikes deg": lambda strides: strides.pitch_strike,
-    "arm swing deg": lambda strides: strides.arm_swing,
-}
-"""Columns of the table of strides, whose medians it shows."""
-
-SLIDING = 0.2
-"""m/s. The feet of a motion that is read correctly slide less, those of one that is not more."""
-
 
 def main() -> None:
     """Do what the command line says."""
-    arguments = _parser().parse_args()
+    arguments = parser().parse_args()
     try:
-        arguments.run(arguments)
+        require_files(arguments)
+        from torchrl_mcp.cli import motion_files
+
+        getattr(motion_files, arguments.run)(arguments)
     except (BadZipFile, OSError, RuntimeError, ValueError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         sys.exit(2)
 
 
-def import_files(arguments: argparse.Namespace) -> None:
-    """Write a clip for each file, and one of its mirror image if wanted."""
-    motions = _load(arguments)
-    if arguments.mirror:
-        motions |= {
-            f"{name}_mirrored": motion._replace(clip=motion.clip.mirrored()) for name, motion in motions.items()
-        }
-    _save(motions, arguments.output)
+def require_files(arguments: argparse.Namespace) -> None:
+    """Check that the files of the command line are there.
+
+    Raises:
+        FileNotFoundError: If one is not.
+    """
+    for path in getattr(arguments, "files", []):
+        if not path.exists():
+            raise FileNotFoundError(f"there is no {path}")
 
 
-def inspect_files(arguments: argparse.Namespace) -> None:
-    """Say what motions are like."""
-    motions = _load(arguments)
-    print(_table(motions))
-    if arguments.strides:
-        print(f"\n{_strides(motions)}")
-
-
-def render_files(arguments: argparse.Namespace) -> None:
-    """Draw a contact sheet and a film of each motion."""
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    for name, (clip, _) in _load(arguments).items():
-        sheet, film = arguments.output / f"{name}.png", arguments.output / f"{name}.gif"
-        save_picture(contact_sheet(clip), sheet)
-        save_film(clip, film, seconds=arguments.seconds)
-        print(f"{sheet}\n{film}")
-
-
-def build_paper_corpus(arguments: argparse.Namespace) -> None:
-    """Write the clips of the paper's corpus, from files that the user has downloaded."""
-    paths = {name: sorted(arguments.folder.rglob(name))[:1] for name in PAPER_CORPUS}
-    if missing := [name for name, found in paths.items() if not found]:
-        lines = "".join(f"\n  {name} (from {SOURCES[Path(name).suffix]})" for name in missing)
-        raise ValueError(f"{arguments.folder} lacks{lines}\nDownload them into it, and mind their terms of use.")
-    motions = {}
-    for name, [path] in paths.items():
-        motion = imported(path, arguments.character, rate=arguments.rate)
-        clip = motion.clip
-        if abs(clip.duration - PAPER_CORPUS[name]) > 0.1:
-            expected = f"{path} lasts {clip.duration:.2f} s, and the paper's corpus needs {PAPER_CORPUS[name]:.2f} s"
-            raise ValueError(f"{expected}: it is another file, or was changed; download it again")
-        motions[path.stem] = motion
-        if not clip.loop:
-            motions[f"{path.stem}_mirrored"] = motion._replace(clip=clip.mirrored())
-    _save(motions, arguments.output)
-
-
-def _load(arguments: argparse.Namespace) -> dict[str, Import]:
-    """Read the files, by their names without suffix."""
-    motions: dict[str, Import] = {}
-    for path in arguments.files:
-        if path.stem in motions:
-            raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
-        if path.suffix == ".npz":
-            motions[path.stem] = Import(MotionClip.load(path), math.nan)
-            continue
-        motions[path.stem] = imported(
-            path,
-            arguments.character,
-            rate=arguments.rate,
-            fps=arguments.fps,
-            scale=arguments.scale,
-            joint_map=_joint_map(arguments.map),
-            skip=arguments.skip,
-            rest_frame=arguments.rest_frame,
-            asf=arguments.asf,
-        )
-    return motions
-
-
-def _save(motions: Mapping[str, Import], folder: Path) -> None:
-    """Write clips into a folder, and say what they are like."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, (clip, _) in motions.items():
-        clip.save(folder / f"{name}.npz")
-    print(f"{_table(motions)}\nwritten to {folder}")
-
-
-def _table(motions: Mapping[str, Import]) -> str:
-    """Return a line for each clip, and warn of those whose feet slide."""
-    summaries = {name: summarised(motion.clip) for name, motion in motions.items()}
-    rows = [_row(name, *motion, summaries[name]) for name, motion in motions.items()]
-    total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
-    rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
-    lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
-    if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
-        lines += f"\nThe feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
-    return lines
-
-
-def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tuple[str, ...]:
-    demand = feasibility(clip)
-    return (
-        name,
-        clip.character,
-        f"{numbers.duration:.2f}",
-        f"{clip.fps:.4g}{' loop' if clip.loop else ''}",
-        f"{numbers.speed:.2f}",
-        f"{numbers.turn_rate:.2f}",
-        "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
-        f"{math.degrees(demand.limit):.1f} deg",
-        f"{100 * demand.penetration:.1f} cm",
-        f"{100 * demand.crossing:.1f} cm",
-        f"{demand.torque:.2f}",
-        "-" if math.isnan(rest_lean) else f"{rest_lean:.1f} deg",
-    )
-
-
-def _strides(motions: Mapping[str, Import]) -> str:
-    """Return a line of medians over the whole strides of each clip of a human body."""
-    rows = []
-    for name, (clip, _) in motions.items():
-        if clip.character in HUMANS:
-            strides = gait_statistics(clip)
-            medians = [
-                float(measure(strides).quantile(0.5)) if len(strides.speed) else math.nan
-                for measure in STRIDES.values()
-            ]
-            cells = ("-" if math.isnan(median) else f"{median:.3g}" for median in medians)
-            rows.append({"clip": name, "strides": str(len(strides.speed)), **dict(zip(STRIDES, cells, strict=True))})
-    return text_table(rows)
-
-
-def _joint_map(pairs: list[str]) -> dict[str, str] | None:
-    """Read ``PART=JOINT``."""
-    if wrong := [pair for pair in pairs if "=" not in pair]:
-        raise ValueError(f"--map {wrong[0]} is not of the form PART=JOINT, such as left_knee=LKnee")
-    return {part.strip(): joint.strip() for part, _, joint in (pair.partition("=") for pair in pairs)} or None
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
-        description="Import motion capture, look at it, and rebuild the paper's corpus.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Import motion capture, look at it, and rebuild the paper's corpus.", EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
     target.add_argument("--character", choices=HUMANS, default="humanoid", help="who moves (default humanoid)")
@@ -247,18 +72,18 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("import", parents=[source, target], help="write clips (.npz)")
     command.add_argument("--mirror", action="store_true", help="write mirror images as well")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
-    command.set_defaults(run=import_files)
+    command.set_defaults(run="import_files")
     command = commands.add_parser("inspect", parents=[source, target], help="duration, speed, turn rate, slide, limits")
     command.add_argument("--strides", action="store_true", help="length, cadence, width and more of human strides, too")
-    command.set_defaults(run=inspect_files)
+    command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
     command.add_argument("--seconds", type=float, default=10.0, help="length of the film at most (default 10)")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
-    command.set_defaults(run=render_files)
+    command.set_defaults(run="render_files")
     command = commands.add_parser("build-paper-corpus", parents=[target], help="230 s of walking, from your downloads")
     command.add_argument("folder", type=Path, metavar="FOLDER", help="where the downloaded files are")
     command.add_argument("--output", type=Path, default=Path("corpus"), help="folder for the clips (default corpus)")
-    command.set_defaults(run=build_paper_corpus)
+    command.set_defaults(run="build_paper_corpus")
     return parser
 
 

@@ -5,19 +5,20 @@ import sys
 import threading
 from pathlib import Path
 
-from rich.console import Console
+from torchrl_mcp.cli.parsing import new_parser
 
-from torchrl_mcp.runs.status import look, overview, table
+PROGRAM = "torchrl-mcp-status"
 
 
 def main() -> None:
     """Show the runs of a folder."""
-    parser = argparse.ArgumentParser(prog="torchrl-mcp-status", description=__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=Path("runs"), help="of run folders (default runs)")
-    parser.add_argument("--follow", action="store_true", help="go on until interrupted")
-    arguments = parser.parse_args()
+    arguments = parser().parse_args()
     if not arguments.folder.is_dir():
-        sys.exit(f"torchrl-mcp-status: there is no folder {arguments.folder}")
+        sys.exit(f"{PROGRAM}: there is no folder {arguments.folder}")
+    from rich.console import Console
+
+    from torchrl_mcp.runs.status import look, overview, table
+
     if not arguments.follow:
         Console().print(table(look(arguments.folder), arguments.folder))
         return
@@ -26,6 +27,14 @@ def main() -> None:
             threading.Event().wait()
     except KeyboardInterrupt:
         return
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Show the progress of all runs of a folder.")
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("runs"), help="of run folders (default runs)")
+    parser.add_argument("--follow", action="store_true", help="go on until interrupted")
+    return parser
 
 
 if __name__ == "__main__":

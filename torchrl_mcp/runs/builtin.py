@@ -1,14 +1,6 @@
 """Networks that come with the library: primitives and gates that follow its generated motions."""
 
-import copy
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import nn
-
-from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FOLDER = Path(__file__).parents[1] / "networks"
 
@@ -36,24 +28,10 @@ def locate(checkpoint: str) -> Path:
     """Return the run folder or checkpoint file that a command line names, which may be ``builtin:CHARACTER``.
 
     Raises:
-        ValueError: If the networks do not come with the library.
+        ValueError: If the networks do not come with the library, or nothing has that name.
     """
-    is_builtin = checkpoint.startswith(PREFIX)
-    return builtin("mcp", checkpoint.removeprefix(PREFIX)) if is_builtin else Path(checkpoint)
-
-
-def publish(parts: nn.ModuleDict, config: Mapping[str, Any], path: Path) -> None:
-    """Write parts of an agent, parameters rounded to bfloat16, as a checkpoint to play or to transfer from.
-
-    Networks that run in bfloat16 autocast round their parameters anyway.
-
-    Args:
-        parts: What to write, by name.
-        config: The run's configuration.
-        path: The file; its folder is made.
-    """
-    rounded = copy.deepcopy(parts)
-    for parameter in rounded.parameters():
-        parameter.data = parameter.data.to(torch.bfloat16)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    run_checkpoint(rounded).save(path, metadata={"config": config})
+    if checkpoint.startswith(PREFIX):
+        return builtin("mcp", checkpoint.removeprefix(PREFIX))
+    if not Path(checkpoint).exists():
+        raise ValueError(f"there is no {checkpoint}: give a run folder, a checkpoint file, or {PREFIX}CHARACTER")
+    return Path(checkpoint)

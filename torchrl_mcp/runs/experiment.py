@@ -16,9 +16,10 @@ from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.build import Agent, make_agent, make_env, make_source, make_trainer
-from torchrl_mcp.runs.builtin import builtin, publish
+from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import provenance
+from torchrl_mcp.runs.publish import publish
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.precision import choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, replacing, write_json

@@ -1,0 +1,57 @@
+import json
+
+import pytest
+
+from torchrl_mcp.cli.summary import final_return, summary
+from torchrl_mcp.report.paper import TABLE_2
+
+CONFIG = """
+task: {name: heading}
+character: {name: biped}
+method: {name: mcp}
+stage: {name: transfer}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "config.yaml").write_text(CONFIG)
+    (tmp_path / "metrics.csv").write_text("iteration,episode/normalised_return\n1,0.25\n2,0.5\n3,nan\n")
+    return tmp_path
+
+
+def evaluate(folder):
+    numbers = {"normalised_return": 0.75, "interval": [0.7, 0.8]}
+    exploring = {"normalised_return": 0.625, "interval": [0.6, 0.65]}
+    content = {"episodes": 128, "deterministic": numbers, "stochastic": exploring}
+    (folder / "evaluation.json").write_text(json.dumps(content))
+
+
+def test_a_run_ends_with_its_returns_beside_the_papers_and_the_next_commands(folder):
+    evaluate(folder)
+    lines = summary(folder).splitlines()
+    assert lines[0] == f"run folder: {folder}"
+    assert "128 episodes" in lines[1]
+    assert [line.split()[:2] for line in lines[2:4]] == [["deterministic", "0.750"], ["exploring", "0.625"]]
+    assert f"paper {TABLE_2['heading', 'biped', 'mcp'].mean:.3f}" in lines[4]
+    commands = [line.split() for line in lines[lines.index("next:") + 1 :]]
+    assert commands == [[f"torchrl-mcp-{name}", str(folder)] for name in ("play", "evaluate", "report")]
+
+
+def test_pretraining_has_no_figure_of_the_papers(folder):
+    evaluate(folder)
+    (folder / "config.yaml").write_text(CONFIG.replace("transfer", "pretrain"))
+    assert "paper" not in summary(folder)
+
+
+def test_the_final_return_is_that_of_the_evaluation_or_else_the_last_that_is_known(folder):
+    assert final_return(folder) == 0.5
+    assert "0.500" in summary(folder)
+    evaluate(folder)
+    assert final_return(folder) == 0.75
+
+
+def test_before_the_first_episode_ends_there_is_no_return(folder):
+    (folder / "metrics.csv").write_text("iteration,episode/normalised_return\n1,nan\n")
+    assert final_return(folder) is None
+    assert "no episode has ended" in summary(folder)

@@ -1,0 +1,26 @@
+"""The command line that all commands share. It imports neither torch nor MuJoCo nor Hydra, which take seconds."""
+
+import argparse
+import sys
+
+from torchrl_mcp import __version__
+
+
+def new_parser(program: str, description: str, examples: str = "") -> argparse.ArgumentParser:
+    """Return the parser of a command, which has ``--version``.
+
+    Args:
+        program: Name of the command.
+        description: What it does, in a sentence.
+        examples: What follows the options, printed as it is.
+    """
+    parser = argparse.ArgumentParser(
+        prog=program, description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"{program} {__version__}")
+    return parser
+
+
+def announce(program: str) -> None:
+    """Say that a command is about to import its libraries, which takes seconds in which nothing else is to be seen."""
+    print(f"{program} {__version__}: loading PyTorch and MuJoCo ...", file=sys.stderr, flush=True)

@@ -1,0 +1,68 @@
+"""What a run says when it ends: its numbers, its folder, and what to do next."""
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_mcp.report.paper import TABLE_2
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS
+
+QUANTITY = "episode/normalised_return"
+
+
+def summary(folder: Path) -> str:
+    """Return the last words of the run in a folder: returns beside the paper's, and the next commands."""
+    lines = [f"run folder: {folder}", *_returns(folder), "next:"]
+    lines += [f"  torchrl-mcp-{command}" for command in (f"play {folder}", f"evaluate {folder}", f"report {folder}")]
+    return "\n".join(lines)
+
+
+def final_return(folder: Path) -> float | None:
+    """Return the normalised return of the run in a folder, or None if no episode has ended.
+
+    That of its evaluation, with deterministic actions; without one, the last of training.
+    """
+    if evaluation := _evaluation(folder):
+        return evaluation["deterministic"]["normalised_return"]
+    return last_return(folder)
+
+
+def last_return(folder: Path) -> float | None:
+    """Return the normalised return of the last iteration of training in which an episode ended, None if none has."""
+    if not (folder / METRICS).is_file():
+        return None
+    with (folder / METRICS).open(newline="") as file:
+        returns = [float(row.get(QUANTITY) or "nan") for row in csv.DictReader(file)]
+    return next((value for value in reversed(returns) if math.isfinite(value)), None)
+
+
+def _returns(folder: Path) -> list[str]:
+    """Lines of returns: with deterministic actions, exploring, and in the paper."""
+    if not (evaluation := _evaluation(folder)):
+        last = last_return(folder)
+        return [f"normalised return in training: {'no episode has ended' if last is None else f'{last:.3f}'}"]
+    modes = {"deterministic": evaluation["deterministic"], "exploring": evaluation["stochastic"]}
+    values = [
+        "{} {:.3f} ({:.3f} to {:.3f})".format(mode, numbers["normalised_return"], *numbers["interval"])
+        for mode, numbers in modes.items()
+    ]
+    episodes = f"normalised return of {evaluation['episodes']} episodes, with its 95 % interval:"
+    return [episodes, *(f"  {value}" for value in [*values, *_paper(OmegaConf.load(folder / CONFIG))])]
+
+
+def _paper(cfg: Any) -> list[str]:
+    """Table 2 of the paper for a run that transfers, if it has this cell."""
+    assert isinstance(cfg, DictConfig)
+    reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
+    if cfg.stage.name != "transfer" or reported is None:
+        return []
+    return [f"paper {reported.mean:.3f} +- {reported.std:.3f}, after a budget that it does not state"]
+
+
+def _evaluation(folder: Path) -> dict[str, Any]:
+    path = folder / EVALUATION
+    return json.loads(path.read_text()) if path.is_file() else {}

@@ -1,0 +1,123 @@
+"""The results of many runs beside the paper's, as a web page and as Markdown."""
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+from itertools import count
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from torchrl_mcp import __version__
+from torchrl_mcp.report.comparison import cells, methods, over_tasks
+from torchrl_mcp.report.paper import TABLE_2
+from torchrl_mcp.report.results import MODES, STATES, Damaged, Run
+from torchrl_mcp.report.sections import (
+    Row,
+    Section,
+    ablation_chapters,
+    diagnostic_tables,
+    method_colours,
+    place_title,
+    row,
+    task_sections,
+)
+from torchrl_mcp.training import precision
+
+PAGES = ("report.html", "report.md")
+
+HARDWARE = ("processor", "cores", "device")
+LIBRARIES = ("python", "torch", "torchrl", "mujoco")
+
+
+def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime) -> dict[str, str]:
+    """Return the report by file name, ``report.html`` and ``report.md``.
+
+    Args:
+        runs: Runs, in whatever state.
+        damaged: Folders that could not be read.
+        moment: When they were read.
+    """
+    environment = Environment(
+        loader=PackageLoader("torchrl_mcp.report"),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= FILTERS
+    context = _context(runs, damaged) | {"moment": f"{moment:%Y-%m-%d %H:%M %Z}", "version": __version__}
+    return {name: environment.get_template(name).render(context) for name in PAGES}
+
+
+def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
+    """What the templates show."""
+    found = cells(runs)
+    stages = {stage: [cell for cell in found if cell.stage == stage] for stage in ("transfer", "pretrain")}
+    names = (f"plot-{number}" for number in count(1))
+    machines = list(dict.fromkeys(map(_machine, runs)))
+    shared, aggregate = over_tasks(found)
+    palette = method_colours(found)
+    context = {
+        "runs": [run for cell in found for run in cell.runs],
+        "states": states(runs, damaged),
+        "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
+        "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_standard]),
+        "titles": methods(found),
+        "shared": shared,
+        "aggregate": aggregate,
+        "transfer": task_sections(stages["transfer"], names, palette),
+        "ablations": ablation_chapters(found, names),
+        "diagnostics": diagnostic_tables(found),
+        "pretraining": task_sections(stages["pretrain"], names, palette),
+        "machines": machines,
+    }
+    return context | {
+        "modes": MODES,
+        "table_2": TABLE_2,
+        "isfinite": math.isfinite,
+        "machine_number": lambda run: machines.index(_machine(run)) + 1,
+    }
+
+
+def states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
+    """Number of runs by state."""
+    states = [run.state for run in runs] + ["damaged"] * len(damaged)
+    return {state: states.count(state) for state in STATES}
+
+
+def _overview(rows: Sequence[Row]) -> dict[str, Any]:
+    """Columns and rows of Table 2: the methods, and a section per task and character."""
+    places = dict.fromkeys(r.cell.place for r in rows)
+    sections = {place: Section(place_title(place), [r for r in rows if r.cell.place == place]) for place in places}
+    return {"methods": methods(r.cell for r in rows), "sections": sections}
+
+
+def _machine(run: Run) -> str:
+    """The machine, the precision of the networks and the libraries of a run in one line."""
+    machine = run.provenance.get("machine") or {}
+    parts = (
+        f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
+    )
+    autocast = run.settings.get("autocast")
+    networks = [f"networks in {precision.name(autocast)}"] if isinstance(autocast, bool) else []
+    versions = (f"{name} {machine[name]}" for name in LIBRARIES if name in machine)
+    return ", ".join([*parts, *networks, *versions]) or "unknown"
+
+
+def _duration(seconds: float) -> str:
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
+
+
+FILTERS = {
+    "figure": "{:.3f}".format,
+    "signed": lambda value: f"{value:+.3f}".replace("-", "−"),
+    "steps": "{:,}".format,
+    "duration": _duration,
+    "capital": lambda text: text[:1].upper() + text[1:],
+    "words": lambda name: name.replace("_", " ").capitalize(),
+    "place": place_title,
+    "cell": lambda text: str(text).replace("|", r"\|").replace("\n", " "),
+}
+"""Of the templates. ``cell`` is for Markdown's tables."""
