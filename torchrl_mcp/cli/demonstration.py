@@ -6,7 +6,6 @@ transfer together. Everything lands in one folder, and what is there already is 
 
 import json
 import math
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,13 +15,14 @@ from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from torchrl_mcp import __version__, analysis
+from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.identity import PLACES, differences
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.checkpoint import FOLDER
 from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
 from torchrl_mcp.viewer.film import save_film
@@ -194,27 +194,20 @@ def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
 
 
 def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
-    """Show how far training and evaluation are, until both are done."""
+    """Show how far training is, and then evaluation, until both are done."""
     files = [evaluation_file(folder, name) for name in policies(folder, runs)]
     files += [trajectory_file(folder, name) for name in PANELS]
-    totals = {name: _steps(cfg) for name, cfg in runs.items()}
-    interval = 1.0 if sys.stderr.isatty() else 15.0
-    form = "{desc} {percentage:3.0f}% |{bar:8}|"
-    with (
-        tqdm(desc="evaluation", total=len(files), bar_format=form, position=1) as evaluation,
-        tqdm(
-            desc="training  ",
-            total=sum(totals.values()),
-            bar_format=form + " {elapsed}<{remaining}{postfix}",
-            position=0,
-        ) as training,
-    ):
-        for _ in ticks(processes, interval):
-            rows = {name: analysis.read_metrics(folder / name) for name in runs}
-            done = {name: table[-1]["frames"] if table else 0.0 for name, table in rows.items()}
-            training.n, evaluation.n = sum(done.values()), sum(file.exists() for file in files)
-            training.set_postfix_str(", ".join(f"{name} {done[name] / totals[name]:.0%}" for name in runs))
-            evaluation.refresh()
+    total, done = sum(map(_steps, runs.values())), _steps_taken(folder, runs)
+    moments = ticks(processes, interval=1.0)
+    with TrainingBar(total, done) as shown:
+        for _ in moments:
+            before, done = done, _steps_taken(folder, runs)
+            shown.advance(done - before, math.nan)
+            if done == total:
+                break
+    with bar(len(files), "evaluation") as evaluated:
+        for _ in moments:
+            evaluated.update(sum(file.exists() for file in files) - evaluated.n)
 
 
 def report(folder: Path, runs: Runs) -> str:
@@ -265,6 +258,12 @@ def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]
         steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
         rows.append({"policy": line.label, **steps, **scores})
     return text_table(rows, markdown=True)
+
+
+def _steps_taken(folder: Path, runs: Runs) -> int:
+    """Environment steps of all runs so far."""
+    tables = (analysis.read_metrics(folder / name) for name in runs)
+    return sum(int(table[-1]["frames"]) for table in tables if table)
 
 
 def _steps(cfg: DictConfig) -> int:

@@ -6,7 +6,6 @@ With ``--output RUN/evaluation.json`` it leaves in a run folder what training en
 import argparse
 import math
 import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ def main() -> None:
     report(arguments, results, [asdict(clip) for clip in clips])
 
 
-def report(arguments: argparse.Namespace, results: Mapping[str, Any], clips: Sequence[Mapping[str, object]]) -> None:
+def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[dict[str, Any]]) -> None:
     """Print the statistics, and write them to a file if wanted."""
     from torchrl_mcp.evaluation.diagnostics import COLLAPSED
     from torchrl_mcp.runs.tables import text_table

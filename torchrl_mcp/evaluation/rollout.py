@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs.transfer import task_reward
+from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.evaluation.statistics import mean
 
 
@@ -72,8 +73,10 @@ def evaluate(
     for key in names:
         kind = flags if env.observation_spec[key].dtype is torch.bool else sums
         kind[key] = torch.zeros_like(state[key])
-    with set_exploration_type(exploration):
+    steps = getattr(env, "max_episode_steps", None)
+    with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
         while running.any():
+            shown.update()
             decision = policy(state.select(*policy.in_keys).to(device))
             decisions.append(decision.select(*record)[running.to(device)])
             step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))

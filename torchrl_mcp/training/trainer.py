@@ -15,11 +15,11 @@ from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.objectives import KLAdaptiveLR
-from tqdm import tqdm
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules import RunningNormaliser
+from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.checkpoint import load, run_checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.dead_units import DeadUnits
@@ -67,7 +67,7 @@ class Trainer:
         autocast: Run all networks in bfloat16 autocast, in source and loss alike.
         device: Where the networks are; physics stays on the CPU.
         checkpoint_interval: Iterations between checkpoints.
-        progress_bar: Show a progress bar.
+        progress_bar: Show the progress on standard error.
 
     Raises:
         ValueError: If the batch does not divide evenly.
@@ -160,9 +160,7 @@ class Trainer:
         self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
 
     def _loop(self) -> None:
-        with tqdm(
-            total=self.total_frames, initial=self.progress.frames, unit="step", disable=not self.progress_bar
-        ) as bar:
+        with TrainingBar(self.total_frames, self.progress.frames, shown=self.progress_bar) as bar:
             while self.progress.frames < self.total_frames:
                 start = time.perf_counter()
                 self.stopwatch.seconds.clear()
@@ -179,8 +177,7 @@ class Trainer:
                     self._update_normalisers(batch)
                 self.frozen.verify()
                 self._advance(metrics, time.perf_counter() - start)
-                bar.set_postfix_str(self._summary(metrics), refresh=False)
-                bar.update(batch.numel())
+                bar.advance(batch.numel(), metrics["episode/normalised_return"])
 
     def _behaviour(self) -> TensorDictModuleBase:
         """Return the policy as it collects: what it writes is what the loss reads, and no more."""
@@ -299,12 +296,6 @@ class Trainer:
         self.metrics_writer.write(vars(progress) | metrics, step=progress.frames)
         if progress.iteration % self.checkpoint_interval == 0 or progress.frames >= self.total_frames:
             self.save()
-
-    def _summary(self, metrics: dict[str, float]) -> str:
-        shares = " ".join(
-            f"{section} {metrics[f'time/{section}']:.0%}" for section in (*self.stopwatch.seconds, "other")
-        )
-        return f"return {metrics['episode/normalised_return']:.3f} | {shares}"
 
     def _precision(self) -> torch.autocast:
         # Entered anew for every use: within one context autocast keeps its copies of the weights.

@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
+from tqdm import tqdm
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.rendering import Camera, save_gif
 from torchrl_mcp.envs.scenery import softly_lit
+from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.viewer.bars import draw_bars
 from torchrl_mcp.viewer.player import Player
@@ -121,7 +123,14 @@ def save_film(
     if width < 2 or height < 2:
         raise ValueError(f"width={width} and height={height} are too small for a picture: pass at least 2 pixels each")
     pictures = film(player, seconds=seconds, width=width, height=height, every=every)
-    save(pictures, path, interval=interval)
+    with bar(round(seconds / interval), path.name) as shown:
+        save(_counted(pictures, shown), path, interval=interval)
+
+
+def _counted(pictures: Iterable[Image.Image], shown: tqdm) -> Iterator[Image.Image]:
+    for picture in pictures:
+        yield picture
+        shown.update()
 
 
 def save_mp4(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
