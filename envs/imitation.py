@@ -103,6 +103,11 @@ class Imitation(PDCharacterEnv):
         max_episode_steps: int = 300,
         **kwargs: Any,
     ) -> None:
+        if not isinstance(clips, MotionLibrary | Mapping):
+            raise ValueError(
+                f"clips={clips!r} must be a MotionLibrary or clips by name: read a folder with folder_library of "
+                "torchrl_mcp.envs.motions.corpus, or train with motions=folder motions.path=FOLDER"
+            )
         library = clips if isinstance(clips, MotionLibrary) else MotionLibrary(clips)
         if library.character != character:
             raise ValueError(f"clips are of {library.character}: pass motions of character={character!r}")

@@ -3,8 +3,8 @@ import sys
 import pytest
 from PIL import Image
 
-from torchrl_mcp.cli import play
-from torchrl_mcp.envs import opengl
+from torchrl_mcp.cli import play, playing
+from torchrl_mcp.envs import Heading, opengl
 
 
 def call(monkeypatch, *arguments):
@@ -53,6 +53,10 @@ def test_an_unknown_argument_of_the_task_is_refused_by_name(monkeypatch):
     assert "--task colour=red" in said
 
 
+def test_a_folder_of_clips_is_refused_with_the_setting_that_takes_one(monkeypatch):
+    assert "motions.path=FOLDER" in refused(monkeypatch, "builtin:biped", "--task", "clips=DIR")
+
+
 def test_a_wrong_argument_of_the_task_is_refused_by_the_task(monkeypatch):
     assert "clip_end='sleep'" in refused(monkeypatch, "builtin:biped", "--task", "clip_end=sleep")
 
@@ -76,3 +80,26 @@ def test_without_a_display_a_window_is_refused_with_what_to_do_instead(monkeypat
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "--viewer web" in refused(monkeypatch, "builtin:biped", "--viewer", "window")
+
+
+@pytest.mark.parametrize(("agent", "moves"), [("zero", False), ("random", True)])
+def test_an_agent_that_has_learnt_nothing_shows_an_environment(monkeypatch, agent, moves):
+    shown = []
+    monkeypatch.setattr(playing, "show", lambda policy, env, options, arguments: shown.append((policy, env)))
+    call(monkeypatch, "--agent", agent, "task=heading", "character=trex", "--seed", 3)
+    [(policy, env)] = shown
+    assert isinstance(env, Heading)
+    actions = env.rollout(3, policy)["action"]
+    assert actions.shape[-1] == 49
+    assert bool(actions.any()) == moves
+    assert (actions.abs() <= 1).all()
+
+
+def test_without_an_agent_one_checkpoint_is_asked_for(monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        call(monkeypatch)
+    assert "give one CHECKPOINT, not 0; or --agent" in capsys.readouterr().err
+
+
+def test_an_unknown_setting_of_an_agents_environment_is_refused_without_a_traceback(monkeypatch):
+    assert "task/nope" in refused(monkeypatch, "--agent", "zero", "task=nope")

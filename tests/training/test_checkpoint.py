@@ -1,6 +1,7 @@
 import hashlib
 import io
 import json
+import logging
 import pickle
 import random
 import tempfile
@@ -11,6 +12,7 @@ import pytest
 import torch
 from tensordict import NonTensorData, NonTensorStack
 from torch import nn
+from torchrl import torchrl_logger
 
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.checkpoint import find, load, load_parts, rotation, run_checkpoint, saved_config
@@ -300,3 +302,23 @@ def test_a_pickle_smuggled_into_an_archive_is_not_executed(run, members):
         load_parts(parts, list(parts), file)
     assert not marker.exists()
     assert same(components(parts), components(make(1)))
+
+
+@pytest.mark.parametrize(("version", "warned"), [("{}+cu999", False), ("1.2.{}", True)], ids=["build", "version"])
+def test_only_another_version_of_torch_is_warned_of_and_not_another_build(run, version, warned):
+    path, messages = find(run), []
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(members["manifest.json"])
+    manifest["versions"]["torch"] = version.format(torch.__version__.split("+")[0])
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in (members | {"manifest.json": json.dumps(manifest).encode()}).items():
+            archive.writestr(name, content)
+    handler = logging.Handler()
+    handler.emit = lambda record: messages.append(record.getMessage())
+    torchrl_logger.addHandler(handler)
+    try:
+        load_parts(make(1), ["gating"], path)
+    finally:
+        torchrl_logger.removeHandler(handler)
+    assert any("version skew" in message for message in messages) == warned

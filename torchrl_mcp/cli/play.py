@@ -14,23 +14,37 @@ examples:
   {PROGRAM} builtin:humanoid                              # a film of the networks that come with the library
   {PROGRAM} runs/my-run --output walk.mp4 --seconds 20 --width 1280 --height 720
   {PROGRAM} runs/my-run --viewer web                      # in a browser, with MuJoCo Studio
+  {PROGRAM} --agent random task=carry character=humanoid  # look at an environment before training
   {PROGRAM} runs/my-imitation --task switch_interval=.inf --task clip_end=switch
 """
 
 
 def main() -> None:
     """Do what the command line says."""
-    arguments = parser().parse_args()
+    arguments = parse(sys.argv[1:])
     try:
-        path = locate(arguments.checkpoint)
+        if arguments.agent is None:
+            locate(arguments.checkpoint)
         announce(PROGRAM)
         from torchrl_mcp.cli.playing import play
 
-        play(path, arguments)
+        play(arguments)
     except (RuntimeError, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit()
+
+
+def parse(words: list[str]) -> argparse.Namespace:
+    """Return the arguments, of which ``checkpoint`` is None and ``settings`` are for an untrained ``agent``."""
+    options = parser()
+    arguments = options.parse_args(words)
+    arguments.settings, arguments.checkpoint = arguments.checkpoint, None
+    if arguments.agent is None:
+        if len(arguments.settings) != 1:
+            options.error(f"give one CHECKPOINT, not {len(arguments.settings)}; or --agent, and task=... character=...")
+        arguments.checkpoint = arguments.settings[0]
+    return arguments
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,9 +52,12 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, "Watch a trained policy: in a film, in a browser or in a window.", EXAMPLES)
     parser.add_argument(
         "checkpoint",
+        nargs="*",
         metavar="CHECKPOINT",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER",
+        help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER; with --agent "
+        "settings of an environment instead, as torchrl-mcp-train takes them",
     )
+    parser.add_argument("--agent", choices=["zero", "random"], help="actions of zero, or random ones: nothing trained")
     parser.add_argument("--seed", type=int, default=0, help="of environment and sampling (default 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the likeliest")
     parser.add_argument(

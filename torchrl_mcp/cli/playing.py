@@ -1,30 +1,48 @@
 """A policy in a film, in a browser or in a window."""
 
 import argparse
-from pathlib import Path
 from typing import Any, cast
 
 import torch
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player
 
 
-def play(path: Path, arguments: argparse.Namespace) -> None:
+def play(arguments: argparse.Namespace) -> None:
     """Write a film, or open a viewer until it is closed."""
     torch.manual_seed(arguments.seed)
-    agent, env = _restored(path, arguments.seed, arguments.task)
-    num_options = agent.actor.num_options if isinstance(agent.actor, OptionActor) else 0
+    restored = _restored(arguments) if arguments.agent is None else _agent(arguments)
+    show(*restored, arguments)
+
+
+def show(
+    policy: TensorDictModuleBase,
+    env: CharacterEnv | TransformedCharacterEnv,
+    options: int,
+    arguments: argparse.Namespace,
+) -> None:
+    """Write a film of a policy, or open a viewer until it is closed.
+
+    Args:
+        policy: From what the environment shows to ``action``.
+        env: The environment.
+        options: Number of options among which the policy chooses, 0 if it does not.
+        arguments: The command line.
+    """
     look: dict[str, Any] = {
         "deterministic": not arguments.stochastic,
-        "num_options": num_options,
+        "num_options": options,
         "aside": arguments.ghost_distance,
     }
-    policy = agent.actor.policy
     match arguments.viewer:
         case None:
             size = {"width": arguments.width, "height": arguments.height}
@@ -42,11 +60,30 @@ def play(path: Path, arguments: argparse.Namespace) -> None:
             play_in_window(Player(policy, env, **look))
 
 
-def _restored(path: Path, seed: int, overrides: list[str]) -> tuple[build.Agent, CharacterEnv]:
-    """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
-    arguments = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(overrides)))
+def _restored(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv, int]:
+    """Return the policy of a checkpoint, an environment with some arguments of its task replaced, and its options."""
+    path, settings = locate(arguments.checkpoint), _task_settings(arguments)
     try:
-        _, agent, env = experiment.restore(path, num_envs=1, seed=seed, **arguments)
+        _, agent, env = experiment.restore(path, num_envs=1, seed=arguments.seed, **settings)
     except TypeError as error:
-        raise ValueError(f"--task {' '.join(overrides)}: {error}") from error
-    return agent, env
+        raise ValueError(f"--task {' '.join(arguments.task)}: {error}") from error
+    return agent.actor.policy, env, agent.actor.num_options if isinstance(agent.actor, OptionActor) else 0
+
+
+def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv, int]:
+    """Return a policy that has learnt nothing, the environment of a configuration, and no options."""
+    try:
+        cfg = build.compose_run(*arguments.settings)
+        if cfg.stage.name not in cfg.task:
+            cfg = build.compose_run(*arguments.settings, "stage=transfer")
+    except HydraException as error:
+        raise ValueError(str(error)) from error
+    env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **_task_settings(arguments))
+    act = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[arguments.agent]
+    policy = TensorDictModule(lambda observation: act(), in_keys=["observation"], out_keys=["action"])
+    return policy, env, 0
+
+
+def _task_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of the task that ``--task`` replaces."""
+    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(arguments.task)))

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,6 +23,7 @@ from torchrl.record.loggers.common import Logger
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
@@ -50,7 +52,7 @@ def require_environment(cfg: DictConfig) -> None:
     if cfg.stage.name not in cfg.task:
         raise ValueError(
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
-            f"task={task} with stage=transfer and pretrained=<folder of the pre-training>"
+            f"task={task} with stage=transfer and pretrained=<folder of the pre-training>, or pretrained=builtin"
         )
     # The motions of a character of your own may be what introduces it, so all that is named is imported.
     named = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
@@ -59,6 +61,22 @@ def require_environment(cfg: DictConfig) -> None:
     if able and character not in able:
         known = " or ".join(able)
         raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+
+
+def require_equipment(cfg: DictConfig) -> None:
+    """Check that this machine has the configured device and logger.
+
+    Raises:
+        ValueError: If it has not.
+    """
+    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
+            "build of torch on a machine with a GPU"
+        )
+    kind = cfg.logger.logger_type if cfg.logger else "csv"
+    if kind != "csv" and find_spec(kind) is None:
+        raise ValueError(f"logger={kind} needs {kind}: pip install 'torchrl-mcp[{kind}]', or choose logger=tensorboard")
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
@@ -180,6 +198,15 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
 def make_loggers(cfg: DictConfig) -> list[Logger]:
     """Return the configured logger, if any."""
     return [instantiate(cfg.logger)] if cfg.logger else []
+
+
+def make_recorders(cfg: DictConfig, actor: Actor, folder: Path, loggers: Sequence[Logger]) -> list[Any]:
+    """Return the recorder of films, weights and learning curves, if one is configured."""
+    if cfg.get("record_interval") is None:
+        return []
+    make_film_env = partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
+    num_options = actor.num_options if isinstance(actor, OptionActor) else 0
+    return [instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=num_options)]
 
 
 def compose_run(*overrides: str) -> DictConfig:

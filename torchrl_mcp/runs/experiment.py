@@ -39,6 +39,7 @@ def train(cfg: DictConfig) -> Path:
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
     build.require_environment(cfg)
+    build.require_equipment(cfg)
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
     print(f"{folder}: {precision}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
@@ -245,11 +246,21 @@ def _precision_kept(cfg: DictConfig, folder: Path) -> str:
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     """Train to the end and evaluate what came of it."""
-    trainer.metrics_writer.loggers = build.make_loggers(cfg)
+    loggers = build.make_loggers(cfg)
+    trainer.metrics_writer.loggers = [*loggers, *build.make_recorders(cfg, trainer.actor, folder, loggers)]
     trainer.run()
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
         write_json(numbers, folder / EVALUATION)
+
+
+def _builtin_alternative(cfg: DictConfig) -> str:
+    """Return what else could be given, if networks of the method and the character come with the library."""
+    try:
+        builtin(cfg.method.name, cfg.character.name)
+    except ValueError:
+        return ""
+    return ", or take the networks that come with the library: pretrained=builtin"
 
 
 def _pretrained(cfg: DictConfig) -> Path | None:
@@ -260,7 +271,7 @@ def _pretrained(cfg: DictConfig) -> Path | None:
     if cfg.pretrained is None:
         raise ValueError(
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
-            "give its run folder as pretrained=<folder>"
+            f"give its run folder as pretrained=<folder>{_builtin_alternative(cfg)}"
         )
     if cfg.pretrained == "builtin":
         return builtin(cfg.method.name, cfg.character.name)

@@ -9,7 +9,7 @@ from typing import Any
 CONDUCT = frozenset(
     {
         *("checkpoint_interval", "collector", "device", "keep_checkpoints", "logger"),
-        *("num_threads", "progress_bar", "resume", "torch_threads"),
+        *("num_threads", "progress_bar", "record_interval", "recorder", "resume", "torch_threads"),
     }
 )
 """How a run is carried out. They may change while it is interrupted."""

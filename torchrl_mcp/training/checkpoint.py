@@ -5,13 +5,16 @@ manifest that holds the run's configuration and the library versions. Every part
 own, so that transfer loads the ones it keeps.
 """
 
+import re
 import zlib
 from collections.abc import Collection, Mapping
+from logging import LogRecord
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 from torch import nn
+from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 FOLDER = "checkpoints"
@@ -45,12 +48,15 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
         raise ValueError(f"there is no checkpoint file {path}")
     try:
         _require_plain_data(path)
+        torchrl_logger.addFilter(_tells_of_another_version)
         checkpoint.load(path, components=components, map_location="cpu")
     except UNREADABLE as error:
         raise ValueError(
             f"cannot restore {path}: {error}. The file is damaged or belongs to a different method, character, task or "
             "network size; give a checkpoint of the same configuration"
         ) from error
+    finally:
+        torchrl_logger.removeFilter(_tells_of_another_version)
 
 
 def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None:
@@ -122,6 +128,12 @@ def _require_plain_data(path: Path) -> None:
         for name in archive.namelist():
             if not name.endswith((".json", ".memmap")):
                 raise CheckpointError(f"it holds {name}, which is neither JSON nor a tensor")
+
+
+def _tells_of_another_version(record: LogRecord) -> bool:
+    """Tell whether TorchRL's warning of other versions is worth it: builds of one version, as for CUDA, are alike."""
+    pairs = re.findall(r"checkpoint='([^'+]*)[^']*', runtime='([^'+]*)[^']*'", record.getMessage())
+    return not pairs or any(checkpoint != runtime for checkpoint, runtime in pairs)
 
 
 def _component(part: str) -> str:

@@ -1,0 +1,43 @@
+"""What this machine or the command line lacks is said before a folder exists."""
+
+import importlib.util
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from torchrl_mcp.runs import build, experiment
+
+HEADING = ["task=heading", "character=humanoid"]
+
+
+def configure(folder, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", ["preset=smoke", "logger=none", f"run_dir={folder / 'run'}", *overrides])
+
+
+@pytest.mark.parametrize("kind", ["wandb", "mlflow"])
+def test_a_logger_that_is_not_installed_is_named_with_what_installs_it(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(build, "find_spec", lambda name: None if name == kind else importlib.util.find_spec(name))
+    with pytest.raises(ValueError, match=rf"logger={kind} needs {kind}: pip install 'torchrl-mcp\[{kind}\]'"):
+        experiment.train(configure(tmp_path, f"logger={kind}"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is available")
+def test_without_cuda_its_device_is_refused_as_such(tmp_path):
+    with pytest.raises(ValueError, match=r"device=cuda: .* finds no CUDA device. Pass device=cpu"):
+        experiment.train(configure(tmp_path, "device=cuda"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("overrides", [[], ["stage=transfer"]], ids=str)
+def test_heading_without_pretraining_names_the_networks_that_come_with_the_library(tmp_path, overrides):
+    with pytest.raises(ValueError, match="pretrained=builtin"):
+        experiment.train(configure(tmp_path, *HEADING, *overrides))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_networks_that_do_not_come_with_the_library_are_not_offered(tmp_path):
+    with pytest.raises(ValueError, match=r"pretrained=<folder>$"):
+        experiment.train(configure(tmp_path, *HEADING, "stage=transfer", "method=moe"))

@@ -1,0 +1,161 @@
+"""Films, weights of primitives and learning curves of a run in training, in its folder and its logger."""
+
+import copy
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+from tensordict.nn import TensorDictModuleBase
+from torchrl.record.loggers.common import Logger
+from torchrl.record.loggers.mlflow import MLFlowLogger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
+from torchrl.record.loggers.wandb import WandbLogger
+
+from torchrl_mcp.analysis.curves import QUANTITY, draw_curves, learning_curves, read_metrics
+from torchrl_mcp.analysis.figures import bare, colours, new_figure
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.viewer.film import save_film
+from torchrl_mcp.viewer.player import Player, Weights
+
+FOLDER = "recordings"
+"""Of a run folder."""
+
+
+class Recorder:
+    """A film, the weights of the primitives in it, and the learning curve, every so many iterations.
+
+    It is told of every iteration as a logger is. It draws no random number of the run's, so that a run is the same
+    with it and without.
+
+    Args:
+        folder: The run folder; pictures go into its ``recordings/``.
+        policy: The policy in training.
+        make_env: Makes an environment to play in.
+        loggers: TorchRL loggers that show the pictures as well, as far as they can: TensorBoard, W&B and MLflow.
+        num_options: Number of options among which the policy chooses, 0 if it does not.
+        interval: Iterations between recordings.
+        seconds: Length of the film.
+        width: Of the film, in pixels.
+        height: Of the film, in pixels.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        policy: TensorDictModuleBase,
+        make_env: Callable[[], CharacterEnv | TransformedCharacterEnv],
+        loggers: Sequence[Logger],
+        *,
+        num_options: int,
+        interval: int,
+        seconds: float = 6.0,
+        width: int = 320,
+        height: int = 240,
+    ) -> None:
+        if interval < 1:
+            raise ValueError(f"recorder.interval={interval} must be at least 1, or null for no recordings")
+        self._folder, self._policy, self._make_env, self._loggers = folder, policy, make_env, loggers
+        self._num_options, self._interval, self._seconds = num_options, interval, seconds
+        self._size = {"width": width, "height": height}
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
+        """Record, if it is time.
+
+        Args:
+            metrics: Metrics of an iteration, with its number as ``iteration``.
+            step: Environment steps so far.
+        """
+        if metrics["iteration"] % self._interval:
+            return
+        with _own_random_numbers():
+            for name, path in self._record(step):
+                for logger in self._loggers:
+                    show(logger, name, path, step)
+
+    def _record(self, step: int) -> Iterator[tuple[str, Path]]:
+        """Write each picture, and yield its name and file."""
+        policy = copy.deepcopy(self._policy).cpu()
+        (self._folder / FOLDER).mkdir(exist_ok=True)
+        film, gates, curve = (
+            self._folder / FOLDER / f"{name}-{step:012d}{suffix}"
+            for name, suffix in (("film", ".gif"), ("gates", ".png"), ("curve", ".png"))
+        )
+        try:
+            save_film(
+                policy, self._make_env(), film, seconds=self._seconds, num_options=self._num_options, **self._size
+            )
+            yield "film", film
+        except RuntimeError as error:  # no OpenGL, without which there are weights and curves none the less
+            warnings.warn(f"no film: {error}", stacklevel=2)
+        if figure := self._weights(policy):
+            figure.savefig(gates, dpi=100)
+            yield "gates", gates
+        if any(math.isfinite(row[QUANTITY]) for row in read_metrics(self._folder)):
+            draw_curves(learning_curves({"this run": [self._folder]})).savefig(curve, dpi=100)
+            yield "curve", curve
+
+    def _weights(self, policy: TensorDictModuleBase) -> Figure | None:
+        """Draw the weights of the primitives over the time of the film, if the policy has any."""
+        player = Player(policy, self._make_env(), num_options=self._num_options)
+        found: list[Weights | None] = []
+        for _ in range(round(self._seconds / player.env.control_timestep)):
+            player.step()
+            found.append(player.weights)
+        values = [weights.values for weights in found if weights is not None]
+        return draw_weights(torch.tensor(values), player.env.control_timestep) if values else None
+
+
+def draw_weights(values: torch.Tensor, timestep: float) -> Figure:
+    """Draw weights over time, a line for each primitive.
+
+    Args:
+        values: Shape ``(T, K)``.
+        timestep: Seconds between them.
+    """
+    figure = new_figure(6.0, 3.0)
+    axes = figure.add_subplot()
+    times = timestep * torch.arange(1, len(values) + 1)
+    for number, (line, colour) in enumerate(zip(values.T, colours(values.shape[1]), strict=True), start=1):
+        axes.plot(times.numpy(), line.numpy(), color=colour, linewidth=1.5, label=str(number))
+    axes.set(xlabel="seconds", ylabel="weight", ylim=(-0.02, 1.02))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, title="primitive", fontsize=8)
+    bare(axes)
+    return figure
+
+
+def show(logger: Logger, name: str, path: Path, step: int) -> None:
+    """Show a picture or an animated GIF in a logger.
+
+    TorchRL's own ``log_video`` encodes tensors as films with libraries that this one does not need.
+    """
+    if isinstance(logger, TensorboardLogger):
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        with Image.open(path) as picture:
+            width, height = picture.size
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        logger.experiment._get_file_writer().add_summary(summary, step)
+    elif isinstance(logger, WandbLogger):
+        import wandb
+
+        moving = path.suffix == ".gif"
+        media = wandb.Video(str(path), format="gif") if moving else wandb.Image(str(path))
+        logger.log_scalar(name, media, step=step)
+    elif isinstance(logger, MLFlowLogger):
+        import mlflow
+
+        mlflow.log_artifact(str(path), FOLDER)
+
+
+@contextmanager
+def _own_random_numbers() -> Iterator[None]:
+    """Leave torch's random numbers as they were."""
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+        yield
