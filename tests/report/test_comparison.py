@@ -258,3 +258,18 @@ def test_a_single_method_or_task_is_no_comparison(write_run, write_mcp):
     alone = [write_run(task, task=task, score=0.5) for task in ("heading", "carry")]
     assert over_tasks(grouped(*alone)) == ([], {})
     assert over_tasks(grouped(alone[0], write_mcp("mcp", score=0.5))) == ([], {})
+
+
+@pytest.mark.parametrize(("seeds", "name"), [(1, ""), (2, "range "), (3, "range "), (4, "")])
+def test_what_a_bootstrap_of_few_seeds_gives_is_called_their_range(write_run, seeds, name):
+    scores = [0.4, 0.6, 0.7, 0.9][:seeds]
+    (cell,) = grouped(*(write_run(str(seed), seed=seed, score=score) for seed, score in enumerate(scores)))
+    assert cell.spread == name
+    if name:
+        assert (cell.mean().low, cell.mean().high) == pytest.approx((min(scores), max(scores)))
+
+
+def test_runs_of_the_demonstration_are_named_as_its_own(write_run):
+    folder = write_run("demo/transfer", preset=None, demo__minutes=8)
+    assert read_run(folder).preset == "demo"
+    assert read_run(write_run("mine", preset=None)).preset == "unknown"

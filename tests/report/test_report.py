@@ -102,7 +102,7 @@ def test_a_row_has_our_figures_beside_the_papers(page):
     table = next(section(page, "transfer").all("table"))
     scratch = next(row for row in rows(table) if row[0] == "Scratch")
     assert scratch == [
-        *("Scratch", "0.600 ± 0.265 0.400 to 0.900", "0.500 ± 0.265 0.300 to 0.800", "0.927 ± 0.032", "−0.327"),
+        *("Scratch", "0.600 ± 0.265 range 0.400 to 0.900", "0.500 ± 0.265 range 0.300 to 0.800", "0.927 ± 0.032", "−0.327"),
         *("3 of 4", "1,000", "10 s", "100", "fast", "abc1234"),
     ]
 
@@ -141,8 +141,8 @@ def test_an_ablation_compares_its_settings(page):
     (table,) = section(page, "ablations").all("table")
     assert [row[:2] for row in rows(table)] == [
         ["Setting", "Deterministic"],
-        ["4 primitives", "0.300 ± 0.000 0.300 to 0.300"],
-        ["8 primitives", "0.300 ± 0.132 0.200 to 0.450"],
+        ["4 primitives", "0.300 ± 0.000 range 0.300 to 0.300"],
+        ["8 primitives", "0.300 ± 0.132 range 0.200 to 0.450"],
     ]
 
 
@@ -241,7 +241,7 @@ def test_markdown_has_the_same_figures_in_whole_tables(pages):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
     line = next(line for line in markdown.splitlines() if line.startswith("| Scratch |"))
     assert line.startswith(
-        "| Scratch | **0.600** ± 0.265 (0.400 to 0.900) | **0.500** ± 0.265 (0.300 to 0.800) | 0.927 ± 0.032 | −0.327 |"
+        "| Scratch | **0.600** ± 0.265 (range 0.400 to 0.900) | **0.500** ± 0.265 (range 0.300 to 0.800) | 0.927 ± 0.032 | −0.327 |"
     )
     assert r"damaged\|<b>" in markdown
     assert "- Seed 1 unfinished, 25% of the steps (Scratch)." in markdown
@@ -262,6 +262,17 @@ def test_damaged_folders_alone_make_a_report(write_run):
     folder = write_run("run")
     (folder / "config.yaml").write_text("[")
     assert "1 damaged" in Tree(report(*find_runs([folder]), moment=MOMENT)["report.html"]).root.text
+
+
+def test_the_range_of_two_seeds_is_called_so_and_the_mixers_equations_are_the_papers(write_mcp):
+    folders = [
+        write_mcp(f"{mixer}{seed}", mixer__name=mixer, seed=seed, score=0.5 + seed / 10)
+        for mixer in ("multiplicative", "additive")
+        for seed in range(2)
+    ]
+    for page in report(*find_runs(folders), moment=MOMENT).values():
+        assert "range 0.500 to 0.600" in page
+        assert "composed by Eq. 3, multiplicative, or by Eq. 1, additive" in page
 
 
 def test_the_command_writes_both_files(runs, tmp_path, monkeypatch, capsys):

@@ -71,6 +71,11 @@ class Cell:
             return Estimate(numbers["normalised_return"], *numbers["interval"])
         return mean(self.returns(mode)) if self.complete else None
 
+    @property
+    def spread(self) -> str:
+        """What to call the interval of its mean: a bootstrap of two or three seeds gives no more than their range."""
+        return "range " if len(self.complete) in (2, 3) else ""
+
     def deviation(self, mode: str = "deterministic") -> float:
         """Standard deviation over seeds, NaN of fewer than two."""
         return deviation(self.returns(mode))

@@ -103,8 +103,9 @@ class Run:
 
     @property
     def preset(self) -> str:
-        """Preset of its settings, ``unknown`` of runs that did not note it."""
-        return self.provenance.get("choices", {}).get("preset", "unknown")
+        """Preset of its settings: ``demo`` of the demonstration's runs, ``unknown`` of others that did not note it."""
+        is_demo = any(name.startswith("demo.") for name in self.settings)
+        return self.provenance.get("choices", {}).get("preset", "demo" if is_demo else "unknown")
 
     @property
     def commit(self) -> str:

@@ -24,7 +24,7 @@ ABLATIONS = {
         "Table 4 of the paper, where the humanoid dribbles with 4, 8, 16 and 32.",
     ),
     "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper, where both fare alike on most tasks."),
-    "mixer": ("Mixer", "Primitives composed by Eq. 2, multiplicative, or by Eq. 1, additive."),
+    "mixer": ("Mixer", "Primitives composed by Eq. 3, multiplicative, or by Eq. 1, additive."),
     "exploration": ("Exploration", "Over actions, as in Eq. 4, or over the weights of primitives, as in Section 5.3."),
     "practice": (
         "Practice",
