@@ -62,7 +62,7 @@ class Recorder:
             raise ValueError(f"recorder.interval={interval} must be at least 1, or null for no recordings")
         self._folder, self._policy, self._make_env, self._loggers = folder, policy, make_env, loggers
         self._num_options, self._interval, self._seconds = num_options, interval, seconds
-        self._size = {"width": width, "height": height}
+        self._width, self._height = width, height
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """Record, if it is time.
@@ -88,7 +88,13 @@ class Recorder:
         )
         try:
             save_film(
-                policy, self._make_env(), film, seconds=self._seconds, num_options=self._num_options, **self._size
+                policy,
+                self._make_env(),
+                film,
+                seconds=self._seconds,
+                width=self._width,
+                height=self._height,
+                num_options=self._num_options,
             )
             yield "film", film
         except RuntimeError as error:  # no OpenGL, without which there are weights and curves none the less
