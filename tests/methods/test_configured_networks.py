@@ -4,6 +4,9 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
+from torch import nn
+
+from torchrl_mcp.modules.primitives import BatchedLinear
 
 
 def configure(*overrides):
@@ -72,3 +75,26 @@ def test_parameters_are_as_many_as_the_paper_s_layers_have(method, stage):
     parts = instantiate(cfg.parts)(105, 2, 17)
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert {name: count for name, count in counts.items() if count} == COUNTS[method, stage]
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "transfer"])
+@pytest.mark.parametrize(
+    "method", ["mcp", "moe", "latent_space", "finetune", "hierarchical", "option_critic", "scratch"]
+)
+def test_width_scales_every_hidden_layer_of_every_network(method, stage):
+    hidden = {}
+    for width in (1.0, 0.5):
+        cfg = configure(f"method={method}", f"stage={stage}", "task=heading", "character=biped", f"width={width}")
+        parts = instantiate(cfg.parts)(105, 2, 17)
+        instantiate(cfg.critic)(parts, 105, 2)
+        linear = [layer for layer in parts.modules() if isinstance(layer, (nn.Linear, BatchedLinear))]
+        hidden[width] = [layer.bias.shape[-1] for layer in linear if layer.bias is not None]
+    changed = [(full, half) for full, half in zip(hidden[1.0], hidden[0.5], strict=True) if full != half]
+    assert all(full == 2 * half for full, half in changed)
+    outputs = {1, 7, 8, 16, 17, 34}  # values, logits, terminations and values of options, latents, actions
+    assert all(full in outputs for full, half in zip(hidden[1.0], hidden[0.5], strict=True) if full == half)
+
+
+def test_a_width_without_units_is_refused():
+    with pytest.raises(ValueError, match="width=0"):
+        instantiate(configure("width=0.0").parts)(105, 2, 17)

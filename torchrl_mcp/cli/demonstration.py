@@ -32,7 +32,7 @@ Runs = Mapping[str, DictConfig]
 RUNS = {
     "pretrain": ["method=mcp", "stage=pretrain"],
     "transfer": ["method=mcp", "stage=transfer"],
-    "scratch": ["method=scratch", "stage=transfer", "+parts.policy.num_cells=[512,256]"],
+    "scratch": ["method=scratch", "stage=transfer"],
 }
 
 # Panels of the picture: title, run, and stage whose directions the ant is told to take.

@@ -7,10 +7,16 @@ from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_mcp.methods.actor import GOAL, STATE, normalise_inputs
+from torchrl_mcp.modules.gating import scaled_cells
 
 
 def value_critic(
-    parts: nn.ModuleDict, observation_dim: int, goal_dim: int, *, num_cells: Sequence[int] = (1024, 512)
+    parts: nn.ModuleDict,
+    observation_dim: int,
+    goal_dim: int,
+    *,
+    num_cells: Sequence[int] = (1024, 512),
+    width: float = 1.0,
 ) -> TensorDictSequential:
     """Add the part ``critic``, V(s, g), and return it as a module from ``observation`` and ``goal`` to ``state_value``.
 
@@ -19,6 +25,7 @@ def value_critic(
         observation_dim: Size of the state, ``S``.
         goal_dim: Size of the goal, ``G``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.1. https://arxiv.org/abs/1905.09808
@@ -26,7 +33,7 @@ def value_critic(
     parts["critic"] = MLP(
         in_features=observation_dim + goal_dim,
         out_features=1,
-        num_cells=list(num_cells),
+        num_cells=scaled_cells(num_cells, width),
         activation_class=nn.ReLU,
         activation_kwargs={"inplace": True},  # the same numbers without a second copy of every hidden layer
     )

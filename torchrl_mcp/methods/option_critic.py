@@ -36,6 +36,7 @@ from torchrl_mcp.methods.options import (
     keep_option,
     of_option,
 )
+from torchrl_mcp.modules.gating import scaled_cells
 from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 ARRIVAL = ("next", "observation")
@@ -50,6 +51,7 @@ def option_critic_parts(
     terminations: Callable[..., nn.Module],
     values_cells: Sequence[int],
     num_options: int,
+    width: float = 1.0,
     normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``options``, ``terminations`` and ``critic``.
@@ -61,6 +63,7 @@ def option_critic_parts(
         options: Makes the network of all options, from a state to means and standard deviations, from ``(S, A, K)``.
         terminations: Makes the network of their terminations from ``(S, K)``.
         values_cells: Hidden units of their values.
+        width: Factor on ``values_cells``.
         num_options: Number of options, ``K``.
         normaliser: Makes an input normaliser from a size.
     """
@@ -72,7 +75,7 @@ def option_critic_parts(
             "critic": MLP(
                 in_features=observation_dim + goal_dim,
                 out_features=num_options,
-                num_cells=list(values_cells),
+                num_cells=scaled_cells(values_cells, width),
                 activation_class=nn.ReLU,
                 activation_kwargs={"inplace": True},
             ),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 
 from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 
 
 @dataclass(frozen=True)
@@ -58,17 +58,27 @@ class Terminations(nn.Module):
         observation_dim: Size of the state, ``S``.
         num_options: Number of options, ``K``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
         initial: Probability before training: an option lasts ``1 / initial`` steps on average.
 
     Raises:
         ValueError: If ``initial`` is no probability between 0 and 1.
     """
 
-    def __init__(self, observation_dim: int, num_options: int, *, num_cells: Sequence[int], initial: float) -> None:
+    def __init__(
+        self,
+        observation_dim: int,
+        num_options: int,
+        *,
+        num_cells: Sequence[int],
+        initial: float,
+        width: float = 1.0,
+    ) -> None:
         super().__init__()
         _require_options(num_options)
         if not 0 < initial < 1:
             raise ValueError(f"initial={initial} is not a probability: pass a number between 0 and 1")
+        num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
         nn.init.constant_(self.output.bias, math.log(initial / (1 - initial)))

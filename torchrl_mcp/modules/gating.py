@@ -21,6 +21,7 @@ class Gating(nn.Module):
         state_cells: Hidden units of the state encoder.
         goal_cells: Hidden units of the goal encoder.
         joint_cells: Hidden units after the concatenation.
+        width: Factor on all numbers of hidden units.
         output_gain: Factor on the initial weights of the output layer; small values start all gates alike.
 
     Reference:
@@ -37,9 +38,13 @@ class Gating(nn.Module):
         state_cells: Sequence[int] = (512, 256),
         goal_cells: Sequence[int] = (512, 256),
         joint_cells: Sequence[int] = (256,),
+        width: float = 1.0,
         output_gain: float = 1.0,
     ) -> None:
         super().__init__()
+        state_cells, goal_cells, joint_cells = (
+            scaled_cells(cells, width) for cells in (state_cells, goal_cells, joint_cells)
+        )
         self.state_encoder = relu_mlp(observation_dim, state_cells)
         self.goal_encoder = relu_mlp(goal_dim, goal_cells)
         self.joint = relu_mlp(state_cells[-1] + goal_cells[-1], joint_cells)
@@ -59,6 +64,7 @@ class JointGating(nn.Module):
         goal_dim: Size of the goal, ``G``.
         num_primitives: Number of logits, ``K``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
         output_gain: Factor on the initial weights of the output layer; small values start all gates alike.
 
     Reference:
@@ -72,15 +78,29 @@ class JointGating(nn.Module):
         num_primitives: int,
         *,
         num_cells: Sequence[int] = (1024, 512),
+        width: float = 1.0,
         output_gain: float = 1.0,
     ) -> None:
         super().__init__()
+        num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_primitives, output_gain)
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         return self.output(self.body(observation, goal)).float()
+
+
+def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
+    """Return numbers of hidden units times ``width``, rounded.
+
+    Raises:
+        ValueError: If a layer would have no units.
+    """
+    scaled = [round(cells * width) for cells in num_cells]
+    if min(scaled) < 1:
+        raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")
+    return scaled
 
 
 def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:

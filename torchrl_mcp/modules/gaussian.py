@@ -6,7 +6,7 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 
 
 class GaussianPolicy(nn.Module):
@@ -20,6 +20,7 @@ class GaussianPolicy(nn.Module):
         goal_dim: Size of the goal, ``G``.
         action_dim: Size of the action, ``A``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
         std: Standard deviation, one for all actions or one each, in action units.
         learned_std: Whether ``std`` is where learning begins, or fixed.
         output_gain: Factor on the initial weights of the output layer.
@@ -38,11 +39,13 @@ class GaussianPolicy(nn.Module):
         action_dim: int,
         *,
         num_cells: Sequence[int] = (1024, 512),
+        width: float = 1.0,
         std: float | Sequence[float] = 0.1,
         learned_std: bool = False,
         output_gain: float = 0.01,
     ) -> None:
         super().__init__()
+        num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], action_dim, output_gain)
         self.scale = state_independent_scale(std, action_dim, learned_std)

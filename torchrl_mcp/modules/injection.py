@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp, scaled_linear
+from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 from torchrl_mcp.modules.gaussian import state_independent_scale
 
 
@@ -37,6 +37,7 @@ class InjectedPolicy(nn.Module):
         observation_dim: Size of the state, ``S``.
         action_dim: Size of the action, ``A``.
         num_cells: Hidden units, two layers or more.
+        width: Factor on all numbers of hidden units.
         std: Standard deviation, one for all actions or one each, in action units.
         learned_std: Whether ``std`` is where learning begins, or fixed.
         output_gain: Factor on the initial weights of the output layer.
@@ -54,6 +55,7 @@ class InjectedPolicy(nn.Module):
         action_dim: int,
         *,
         num_cells: Sequence[int] = (1024, 512),
+        width: float = 1.0,
         std: float | Sequence[float] = 0.1,
         learned_std: bool = False,
         output_gain: float = 0.01,
@@ -61,6 +63,7 @@ class InjectedPolicy(nn.Module):
         super().__init__()
         if len(num_cells) < 2:
             raise ValueError(f"num_cells must name two hidden layers or more, got {list(num_cells)}")
+        num_cells = scaled_cells(num_cells, width)
         self.input = nn.Linear(observation_dim, num_cells[0])
         self.rectifier = nn.ReLU()
         self.body = relu_mlp(num_cells[0], num_cells[1:])

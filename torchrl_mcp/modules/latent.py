@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp
+from torchrl_mcp.modules.gating import relu_mlp, scaled_cells
 
 
 class StateGoalEncoder(nn.Module):
@@ -15,15 +15,23 @@ class StateGoalEncoder(nn.Module):
         goal_dim: Size of the goal, ``G``.
         latent_dim: Size of the latent variable, ``L``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
     """
 
     def __init__(
-        self, observation_dim: int, goal_dim: int, latent_dim: int, *, num_cells: Sequence[int] = (1024, 512)
+        self,
+        observation_dim: int,
+        goal_dim: int,
+        latent_dim: int,
+        *,
+        num_cells: Sequence[int] = (1024, 512),
+        width: float = 1.0,
     ) -> None:
         super().__init__()
+        num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = nn.Linear(num_cells[-1], 2 * latent_dim)
 
@@ -44,15 +52,22 @@ class GoalEncoder(StateGoalEncoder):
         goal_dim: Size of the goal, ``G``.
         latent_dim: Size of the latent variable, ``L``.
         num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
     """
 
     def __init__(
-        self, observation_dim: int, goal_dim: int, latent_dim: int, *, num_cells: Sequence[int] = (256, 128)
+        self,
+        observation_dim: int,
+        goal_dim: int,
+        latent_dim: int,
+        *,
+        num_cells: Sequence[int] = (256, 128),
+        width: float = 1.0,
     ) -> None:
-        super().__init__(0, goal_dim, latent_dim, num_cells=num_cells)
+        super().__init__(0, goal_dim, latent_dim, num_cells=num_cells, width=width)
 
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``(*B, L)``, from a goal ``(*B, G)`` alone."""

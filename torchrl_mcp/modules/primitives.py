@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp
+from torchrl_mcp.modules.gating import relu_mlp, scaled_cells
 
 
 class Primitives(nn.Module):
@@ -22,6 +22,7 @@ class Primitives(nn.Module):
         num_primitives: Number of primitives, ``K``.
         trunk_cells: Hidden units shared by all primitives.
         branch_cells: Hidden units of each primitive's own layer; 0 for none.
+        width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
 
@@ -40,6 +41,7 @@ class Primitives(nn.Module):
         *,
         trunk_cells: Sequence[int] = (512, 256),
         branch_cells: int = 256,
+        width: float = 1.0,
         initial_std: float = 1.0,
         output_gain: float = 1.0,
     ) -> None:
@@ -48,6 +50,8 @@ class Primitives(nn.Module):
             raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
         if not initial_std > 0:
             raise ValueError(f"initial_std must be positive, got {initial_std}")
+        trunk_cells = scaled_cells(trunk_cells, width)
+        branch_cells = scaled_cells([branch_cells], width)[0] if branch_cells else 0
         self.trunk = relu_mlp(observation_dim, trunk_cells)
         self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
         self.rectifier = nn.ReLU() if branch_cells else nn.Identity()
