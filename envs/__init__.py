@@ -10,12 +10,15 @@ from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.carry import Carry
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.dribble import Dribble
-from torchrl_mcp.envs.gymnasium_env import register
+from torchrl_mcp.envs.gymnasium_env import register, register_holdout, register_imitation
 from torchrl_mcp.envs.heading import Heading
 from torchrl_mcp.envs.holdout import Holdout
 from torchrl_mcp.envs.imitation import Imitation
+from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 
 __all__ = ["Carry", "CharacterEnv", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
 
 register([Heading, Carry, Dribble], CHARACTERS)
+register_holdout(Holdout)
+register_imitation(Imitation, CHARACTERS, generated_library)

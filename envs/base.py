@@ -141,13 +141,24 @@ class CharacterEnv(EnvBase):
         if (width, height) not in self._cameras:
             self._cameras[width, height] = Camera(self.simulation.model, width=width, height=height)
         camera = self._cameras[width, height]
-        return camera.picture(self.simulation.data(index), self._arrows(index), distance=distance)
+        return camera.picture(self.simulation.data(index), self.arrows(index), distance=distance)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free what drawing holds."""
         while self._cameras:
             self._cameras.popitem()[1].close()
         super().close(raise_if_closed=raise_if_closed)
+
+    def arrows(self, index: int) -> list[Arrow]:
+        """Return what shows the target of one simulation in films and viewers; tasks override it.
+
+        Args:
+            index: The simulation.
+
+        Returns:
+            Arrows, each its tail and tip, ``(3,)`` in metres.
+        """
+        return []
 
     def _make_specs(self) -> None:
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""
@@ -299,7 +310,3 @@ class CharacterEnv(EnvBase):
     def metric_names(self) -> dict[str, list[str]]:
         """What is observed for the record, not for the policy: the names of the entries of each key."""
         return {key: [key] for key in self._observed if key not in ("observation", "goal")}
-
-    def _arrows(self, index: int) -> list[Arrow]:
-        """What to draw beside the simulation."""
-        return []

@@ -1,12 +1,15 @@
 """Gymnasium environments of a single simulation."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from importlib.resources import files
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+import yaml  # type: ignore[import-untyped]
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_mcp.envs.base import CharacterEnv
@@ -84,7 +87,26 @@ def register(tasks: Sequence[type[CharacterEnv]], characters: Iterable[str]) -> 
     """Register every task with every character in Gymnasium, such as ``torchrl_mcp/Heading-Biped-v0``."""
     for task in tasks:
         for character in characters:
-            gymnasium.register(
-                f"torchrl_mcp/{task.__name__}-{character.capitalize()}-v0",
-                entry_point=partial(GymnasiumEnv, task, character=character),
-            )
+            _register(task.__name__, character, partial(GymnasiumEnv, task, character=character))
+
+
+def register_holdout(task: type[CharacterEnv]) -> None:
+    """Register ``torchrl_mcp/Holdout-Ant-v0``, with directions all around unless others are given."""
+    (character,) = task.characters()
+    _register(task.__name__, character, partial(GymnasiumEnv, task, directions=(0.0, 2 * math.pi)))
+
+
+def register_imitation(task: type[CharacterEnv], characters: Iterable[str], motions: Callable[[str, int], Any]) -> None:
+    """Register imitation with every character, of ``motions`` of a seed and with the reward of ``imitation=fast``."""
+
+    def make(character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:
+        terms = yaml.safe_load(files("torchrl_mcp.conf").joinpath("imitation/fast.yaml").read_text())["terms"]
+        settings = {"clips": motions(character, seed_of_motions), "terms": terms, **kwargs}
+        return GymnasiumEnv(task, character=character, **settings)
+
+    for character in characters:
+        _register(task.__name__, character, partial(make, character))
+
+
+def _register(task: str, character: str, entry_point: Callable[..., GymnasiumEnv]) -> None:
+    gymnasium.register(f"torchrl_mcp/{task}-{character.capitalize()}-v0", entry_point=entry_point)

@@ -88,7 +88,8 @@ class Heading(TransferTask):
         direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
         return reward
 
-    def _arrows(self, index: int) -> list[Arrow]:
+    def arrows(self, index: int) -> list[Arrow]:
+        """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
         tail = self._com[index] + torch.tensor([0.0, 0.0, 0.8])
         tip = tail + torch.nn.functional.pad(unit_vector(self.episode["direction"][index]), (0, 1))
         return [(tail.numpy(), tip.numpy())]

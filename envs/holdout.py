@@ -176,7 +176,8 @@ class Holdout(CharacterEnv):
         reward = self._reward(velocity, self.episode["goal"], action, healthy, contacts)
         return reward, ~healthy if self.terminate_when_unhealthy else torch.zeros_like(healthy)
 
-    def _arrows(self, index: int) -> list[Arrow]:
+    def arrows(self, index: int) -> list[Arrow]:
+        """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
         tail = self.simulation.state["qpos"][index, :3] + torch.tensor([0.0, 0.0, 0.6])
         tip = tail + torch.nn.functional.pad(self.episode["goal"][index], (0, 1))
         return [(tail.numpy(), tip.double().numpy())]

@@ -26,7 +26,7 @@ def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Sh
         index: The simulation.
         aside: Metres by which a ghost is moved along y, so as not to cover the character; 0 leaves it where it belongs.
     """
-    shapes = [arrow(*ends) for ends in env._arrows(index)]
+    shapes = [arrow(*ends) for ends in env.arrows(index)]
     if isinstance(env, Imitation):
         qpos = reference(env, index)
         qpos[1] += aside

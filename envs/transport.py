@@ -172,7 +172,7 @@ class Transport(TransferTask):
             reward = reward.masked_fill(self.success(), 1.0)
         return reward
 
-    def _arrows(self, index: int) -> list[Arrow]:
+    def arrows(self, index: int) -> list[Arrow]:
         """From above the character to the object, and from above the object to the target."""
         return [
             pointer(self._com[index], self._object[index]),

@@ -1,9 +1,13 @@
 """The description of a body, with what its MuJoCo file cannot hold."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.resources import as_file, files
+from pathlib import Path
 
 import mujoco
+
+from torchrl_mcp.envs.characters.contract import Violation, violations
 
 
 @dataclass(frozen=True)
@@ -21,12 +25,14 @@ class Character:
         feet: Bodies that may touch the ground.
         key_bodies: Bodies whose positions say most about a pose: head, hands, feet.
         carrier: Body that picks up the box of the carry task, or None for a character that cannot.
+        file: Its MJCF file; None is the library's own of that name.
     """
 
     name: str
     feet: tuple[str, ...]
     key_bodies: tuple[str, ...]
     carrier: str | None
+    file: Path | None = None
 
     def spec(self, *, self_collision: bool = False) -> mujoco.MjSpec:
         """Return the body, to be put into a scene.
@@ -34,9 +40,15 @@ class Character:
         Args:
             self_collision: Let its bodies collide with one another, but for those that a joint connects.
         """
-        with as_file(files(__package__) / f"{self.name}.xml") as path:
+        own = nullcontext(self.file) if self.file else as_file(files(__package__) / f"{self.name}.xml")
+        with own as path:
             spec = mujoco.MjSpec.from_file(str(path))
         for geom in spec.geoms:
             if self_collision and geom.conaffinity:
                 geom.contype = 1
         return spec
+
+    def check(self) -> list[Violation]:
+        """Return where the body violates what is said above of its file, each with its remedy; none, if nowhere."""
+        model = self.spec().compile()
+        return violations(model, feet=self.feet, key_bodies=self.key_bodies, carrier=self.carrier)

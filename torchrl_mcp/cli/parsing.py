@@ -1,6 +1,7 @@
 """The command line that all commands share. It imports neither torch nor MuJoCo nor Hydra, which take seconds."""
 
 import argparse
+import os
 import sys
 
 from torchrl_mcp import __version__
@@ -19,6 +20,11 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
     )
     parser.add_argument("--version", action="version", version=f"{program} {__version__}")
     return parser
+
+
+def find_own_modules() -> None:
+    """Let Python find modules of the folder from which a command is called, after all others."""
+    sys.path.append(os.getcwd())
 
 
 def announce(program: str) -> None:

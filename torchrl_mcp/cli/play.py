@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import announce, find_own_modules, new_parser
 from torchrl_mcp.runs.builtin import locate
 
 PROGRAM = "torchrl-mcp-play"
@@ -25,6 +25,8 @@ def main() -> None:
     try:
         if arguments.agent is None:
             locate(arguments.checkpoint)
+        elif arguments.config_dir:
+            find_own_modules()
         announce(PROGRAM)
         from torchrl_mcp.cli.playing import play
 
@@ -58,6 +60,9 @@ def parser() -> argparse.ArgumentParser:
         "settings of an environment instead, as torchrl-mcp-train takes them",
     )
     parser.add_argument("--agent", choices=["zero", "random"], help="actions of zero, or random ones: nothing trained")
+    parser.add_argument(
+        "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: where settings of your own are"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of environment and sampling (default 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the likeliest")
     parser.add_argument(

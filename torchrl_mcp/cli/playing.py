@@ -72,10 +72,11 @@ def _restored(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Char
 
 def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv, int]:
     """Return a policy that has learnt nothing, the environment of a configuration, and no options."""
+    own = [f"hydra.searchpath=[file://{arguments.config_dir.resolve()}]"] if arguments.config_dir else []
     try:
-        cfg = build.compose_run(*arguments.settings)
+        cfg = build.compose_run(*own, *arguments.settings)
         if cfg.stage.name not in cfg.task:
-            cfg = build.compose_run(*arguments.settings, "stage=transfer")
+            cfg = build.compose_run(*own, *arguments.settings, "stage=transfer")
     except HydraException as error:
         raise ValueError(str(error)) from error
     env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **_task_settings(arguments))

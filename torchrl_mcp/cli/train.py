@@ -4,7 +4,7 @@ import argparse
 import sys
 from importlib.resources import files
 
-from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.cli.parsing import find_own_modules, new_parser
 
 PROGRAM = "torchrl-mcp-train"
 
@@ -41,6 +41,8 @@ def main() -> None:
     from torchrl_mcp.cli.suggestions import suggestions
     from torchrl_mcp.cli.training import run, run_benchmark
 
+    if any(word.startswith(("-cd", "--config-dir")) for word in words):
+        find_own_modules()
     arguments = [word for word in words if word not in ("-m", "--multirun")]
     is_benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
@@ -56,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, "Train a method on a task, alone, in a Hydra multirun, or as a benchmark.", _epilog())
     parser.add_argument("settings", nargs="*", metavar="SETTING=VALUE", help="see below")
     parser.add_argument("-m", "--multirun", action="store_true", help="run every combination of values: seed=0,1,2")
-    parser.add_argument("-cd", "--config-dir", metavar="FOLDER", help="where settings of your own are, beside conf's")
+    parser.add_argument(
+        "-cd", "--config-dir", metavar="FOLDER", help="where settings of your own are, whose modules may be here"
+    )
     parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration, do nothing else")
     parser.add_argument("-sc", "--shell-completion", action="store_true", help="install with -sc install=bash")
     parser.add_argument("--hydra-help", action="store_true", help="what else Hydra has")

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
@@ -49,6 +50,8 @@ def require_environment(cfg: DictConfig) -> None:
         ValueError: If there is none, or the configuration names what this version does not have.
     """
     task, character = cfg.task.name, cfg.character.name
+    if module := cfg.character.get("module"):
+        _import(module, character)
     if cfg.stage.name not in cfg.task:
         raise ValueError(
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
@@ -103,10 +106,9 @@ def require_known(config: Mapping[str, Any], source: Path) -> None:
 
 
 def targets(config: Any) -> Iterator[str]:
-    """Yield the name of everything that a configuration makes, from the top."""
+    """Yield the name of everything that a configuration makes, and of modules to import, from the top."""
     if isinstance(config, Mapping):
-        if isinstance(name := config.get("_target_"), str):
-            yield name
+        yield from (name for key in ("_target_", "module") if isinstance(name := config.get(key), str))
     elif not isinstance(config, list):
         return
     for item in config.values() if isinstance(config, Mapping) else config:
@@ -237,6 +239,19 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
             break
     return found
+
+
+def _import(module: str, character: str) -> None:
+    """Import the module that adds a character to the library's."""
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        raise ValueError(
+            f"character={character} is in the module {module}, which Python does not find: call from the folder of "
+            f"{module}.py, or add that to PYTHONPATH"
+        ) from error
 
 
 def _exists(name: str) -> bool:

@@ -1,0 +1,214 @@
+"""Where a body violates the contract of a :class:`~torchrl_mcp.envs.characters.Character`, and what to do about it."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+SOLE = 0.005
+"""Metres by which the lowest point may miss the ground."""
+
+CONTROL_TIMESTEP = 1 / 30
+"""Seconds per action."""
+
+FREE, BALL, HINGE = (
+    int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE)
+)
+SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+
+
+class Violation(NamedTuple):
+    """A violation of the contract.
+
+    Args:
+        finding: What is wrong.
+        remedy: What to do.
+    """
+
+    finding: str
+    remedy: str
+
+    def __str__(self) -> str:
+        """Return both in one line."""
+        return f"{self.finding}: {self.remedy}"
+
+
+def violations(
+    model: mujoco.MjModel, *, feet: Sequence[str], key_bodies: Sequence[str] = (), carrier: str | None = None
+) -> list[Violation]:
+    """Return where a compiled body violates the contract; none, if it is a character.
+
+    Args:
+        model: The body alone.
+        feet: Bodies that may touch the ground.
+        key_bodies: Bodies whose positions say most about a pose.
+        carrier: Body that could carry a box, if any.
+    """
+    named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
+    return [
+        *_scenery(model),
+        *_root(model),
+        *_joints(model),
+        *_actuators(model),
+        *_shapes(model),
+        *_rest(model),
+        *_names(model, named),
+        *_timestep(model),
+    ]
+
+
+def lowest_bodies(model: mujoco.MjModel, *, within: float = 0.03) -> tuple[float, list[str]]:
+    """Return the height of the lowest point in the rest pose, in metres, and the bodies that come near it.
+
+    Args:
+        model: The body.
+        within: How near, in metres.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    heights = [(_lowest(model, data, geom), model.body(model.geom_bodyid[geom]).name) for geom in colliding(model)]
+    if not heights:
+        return 0.0, []
+    lowest = min(height for height, _ in heights)
+    return lowest, list(dict.fromkeys(name for height, name in heights if height < lowest + within))
+
+
+def colliding(model: mujoco.MjModel) -> list[int]:
+    """Return the shapes of moving bodies that can collide."""
+    collides = (model.geom_contype | model.geom_conaffinity) != 0
+    return np.flatnonzero(collides & (model.geom_bodyid > 0)).tolist()
+
+
+def joints_of(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the joints of a body."""
+    first = model.body_jntadr[body]
+    return list(range(first, first + model.body_jntnum[body]))
+
+
+def kinds_of(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the kinds of the joints of a body."""
+    return [int(model.jnt_type[joint]) for joint in joints_of(model, body)]
+
+
+def _scenery(model: mujoco.MjModel) -> Iterator[Violation]:
+    if own := [model.geom(geom).name or "unnamed" for geom in np.flatnonzero(model.geom_bodyid == 0)]:
+        yield Violation(f"has a floor or other scenery of its own ({', '.join(own)})", "remove it, tasks bring theirs")
+    if model.nlight:
+        yield Violation(f"has {model.nlight} light(s) of its own", "remove them, tasks bring theirs")
+
+
+def _root(model: mujoco.MjModel) -> Iterator[Violation]:
+    roots = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    if len(roots) != 1:
+        yield Violation(f"has {len(roots)} bodies that hang on the world", "let one root carry all others")
+    if model.nbody > 1 and kinds_of(model, 1) != [FREE]:
+        yield Violation(f"the root {model.body(1).name} has no free joint, or others too", "give it a freejoint alone")
+
+
+def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
+    for body in range(2, model.nbody):
+        name, joints = model.body(body).name, joints_of(model, body)
+        kinds = kinds_of(model, body)
+        if not name:
+            yield Violation(f"body {body} has no name", "name it")
+        if len(joints) > 1 and all(kind == HINGE for kind in kinds):
+            names = ", ".join(model.joint(joint).name for joint in joints)
+            yield Violation(f"{name} has several hinges ({names}) where a ball is expected", "make them a ball joint")
+        elif len(joints) > 1 or any(kind not in (BALL, HINGE) for kind in kinds):
+            yield Violation(
+                f"{name} has joints that are neither a hinge nor a ball", "give it one of these, or weld it"
+            )
+        elif joints and model.joint(joints[0]).name != name:
+            yield Violation(f"the joint of {name} is called {model.joint(joints[0]).name}", f"call it {name}")
+        if any(kind == HINGE and not _holds_rest(model, joint) for joint, kind in zip(joints, kinds, strict=True)):
+            yield Violation(f"{name} rests beyond the limits of its joint", "widen its range to hold the rest pose")
+
+
+def _holds_rest(model: mujoco.MjModel, hinge: int) -> bool:
+    """Whether the rest pose is within the limits of a hinge."""
+    low, high = model.jnt_range[hinge]
+    return not model.jnt_limited[hinge] or bool(low <= model.qpos0[model.jnt_qposadr[hinge]] <= high)
+
+
+def _actuators(model: mujoco.MjModel) -> Iterator[Violation]:
+    expected = [name for body in range(2, model.nbody) for name in _controls(model, body)]
+    there = [model.actuator(index).name for index in range(model.nu)]
+    if missing := [name for name in expected if name not in there]:
+        yield Violation(
+            f"lacks the actuators {', '.join(missing)}", "give each hinge one of its name, a ball _x, _y, _z"
+        )
+    if spare := [name or "unnamed" for name in there if name not in expected]:
+        yield Violation(
+            f"has actuators of other names ({', '.join(spare)})", "name them after their bodies, or remove them"
+        )
+    servo = model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0]
+    servo &= (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
+    if torques := [model.actuator(index).name for index in np.flatnonzero(~servo)]:
+        found = f"{len(torques)} actuators are no position servos ({', '.join(torques)})"
+        yield Violation(found, "make them <position>: targets would be taken for torques")
+    if free := [model.actuator(index).name for index in np.flatnonzero(model.actuator_ctrllimited == 0)]:
+        yield Violation(
+            f"actuators have no ctrlrange ({', '.join(free)})", "give them one, to which actions are scaled"
+        )
+
+
+def _controls(model: mujoco.MjModel, body: int) -> list[str]:
+    """Names of the actuators that a body should have."""
+    name, kinds = model.body(body).name, kinds_of(model, body)
+    if not kinds:
+        return []
+    several = BALL in kinds or len(kinds) > 1
+    return [f"{name}_{axis}" for axis in "xyz"] if several else [name]
+
+
+def _shapes(model: mujoco.MjModel) -> Iterator[Violation]:
+    own = colliding(model)
+    other = {mujoco.mjtGeom(model.geom_type[geom]).name for geom in own} - {shape.name for shape in SHAPES}
+    if other:
+        yield Violation(f"collides with shapes of kind {', '.join(sorted(other))}", "use spheres, capsules and boxes")
+    if any((model.geom_contype[geom], model.geom_conaffinity[geom]) != (0, 1) for geom in own):
+        yield Violation("its shapes collide with one another", 'give them contype="0" conaffinity="1"')
+
+
+def _rest(model: mujoco.MjModel) -> Iterator[Violation]:
+    lowest, _ = lowest_bodies(model)
+    if abs(lowest) > SOLE:
+        yield Violation(
+            f"rests {lowest:+.3f} m above the ground", f"lower the root by {lowest:.3f} m: soles are on z = 0"
+        )
+
+
+def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]]) -> Iterator[Violation]:
+    bodies = [model.body(body).name for body in range(1, model.nbody)]
+    if not named["feet"]:
+        yield Violation("no feet are named", f"name the bodies that may touch the ground, of {', '.join(bodies)}")
+    for kind, names in named.items():
+        if unknown := [name for name in names if name not in bodies]:
+            yield Violation(f"{kind} names {', '.join(unknown)}, which it lacks", f"name some of {', '.join(bodies)}")
+    sides = [name for name in bodies if name.startswith(("left_", "right_"))]
+    swapped = {name: {"left": "right", "right": "left"}[name.split("_")[0]] + name[name.index("_") :] for name in sides}
+    if alone := [name for name, twin in swapped.items() if twin not in bodies]:
+        yield Violation(f"{', '.join(alone)} has no twin on the other side", "call pairs left_NAME and right_NAME")
+    elif not sides:
+        yield Violation("there is no mirror map, for no body is called left_NAME or right_NAME", "call pairs so")
+
+
+def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:
+    steps = CONTROL_TIMESTEP / model.opt.timestep
+    if not math.isclose(steps, round(steps), rel_tol=1e-6):
+        yield Violation(f"its timestep of {model.opt.timestep:g} s does not divide 1/30 s", "take 1/120 s, for example")
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height of the lowest point of a shape: of spheres, capsules and boxes, of others that of their bounding box."""
+    height, vertical, size = data.geom_xpos[geom, 2], abs(data.geom_xmat[geom, 6:]), model.geom_size[geom]
+    match int(model.geom_type[geom]):
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return float(height - size[0])
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return float(height - size[0] - vertical[2] * size[1])
+        case _:
+            centre, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            return float(height + data.geom_xmat[geom, 6:] @ centre - vertical @ half_sizes)

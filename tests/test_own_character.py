@@ -1,0 +1,66 @@
+"""The tutorial on a character from a file, command by command, with the smallest budgets."""
+
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_mcp.cli import character, play, train
+from torchrl_mcp.envs import opengl
+from torchrl_mcp.envs.characters import CHARACTERS
+
+TUTORIAL = (Path(__file__).parents[1] / "docs" / "tutorials" / "character.md").read_text()
+PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+COMMAND = re.compile(r"^(torchrl-mcp-\w+) (.*)$", re.MULTILINE)
+PROGRAMS = {f"torchrl-mcp-{module.__name__.rpartition('.')[2]}": module for module in (character, play, train)}
+SMALLER = {
+    "torchrl-mcp-train": "preset=smoke logger=none num_threads=1 torch_threads=1 progress_bar=false "
+    "training.total_frames=128 hydra/job_logging=none hydra/hydra_logging=none",
+    "torchrl-mcp-play": "--seconds 0.2 --width 64 --height 48",
+}
+
+
+@pytest.fixture(scope="module")
+def called(tmp_path_factory):
+    """How each command of the tutorial ended, in a folder that is its working directory."""
+    folder, outcomes = tmp_path_factory.mktemp("tutorial"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", list(sys.path))  # commands add the working directory
+        for code in PYTHON.findall(TUTORIAL):
+            exec(compile(code, "character.md", "exec"), {})
+        for program, arguments in COMMAND.findall(TUTORIAL):
+            if program == "torchrl-mcp-play" and opengl._platform() is None:
+                continue
+            patch.setattr(sys, "argv", shlex.split(f"{program} {arguments} {SMALLER.get(program, '')}"))
+            try:
+                PROGRAMS[program].main()
+                code = 0
+            except SystemExit as stop:
+                code = stop.code
+            outcomes.append((f"{program} {arguments}", code))
+        yield folder, outcomes
+    sys.modules.pop("gymnast", None)
+    CHARACTERS.pop("gymnast", None)
+
+
+def test_only_the_first_check_finds_something(called):
+    _, [(first, code), *others] = called
+    assert (first, code) == ("torchrl-mcp-character check humanoid.xml", 1)
+    assert [(line, code) for line, code in others if code] == []
+    assert {line.split()[0] for line, _ in others} >= {"torchrl-mcp-character", "torchrl-mcp-train"}
+
+
+def test_the_folder_holds_what_the_tutorial_names(called):
+    folder, _ = called
+    for name in ("gymnast.xml", "gymnast.py", "own/character/gymnast.yaml", "runs/gymnast/metrics.csv"):
+        assert (folder / name).is_file()
+    assert CHARACTERS["gymnast"].feet == ("right_foot", "left_foot")
+
+
+@pytest.mark.skipif(opengl._platform() is None, reason="no OpenGL to draw with")
+def test_it_ends_with_a_film(called):
+    folder, _ = called
+    assert all((folder / name).stat().st_size > 1000 for name in ("still.gif", "random.gif", "walk.gif"))

@@ -1,0 +1,61 @@
+"""``torchrl-mcp-character``: check whether an MJCF file is a character, and make one of a body for something else."""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+from torchrl_mcp.cli.parsing import announce, new_parser
+
+PROGRAM = "torchrl-mcp-character"
+
+EXAMPLES = f"""\
+examples:
+  {PROGRAM} check robot.xml                # each violation of what tasks expect, with its remedy
+  {PROGRAM} adapt robot.xml --name robot2  # writes robot2.xml, robot2.py and own/character/robot2.yaml
+"""
+
+
+def main() -> None:
+    """Do what the command line says."""
+    arguments = parser().parse_args()
+    if not arguments.file.is_file():
+        sys.exit(f"{PROGRAM}: there is no file {arguments.file}")
+    announce(PROGRAM)
+    from torchrl_mcp.cli import own_character
+
+    try:
+        sys.exit(getattr(own_character, arguments.run)(arguments))
+    except ValueError as error:
+        sys.exit(f"{PROGRAM}: {error}")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Check whether an MJCF file is a character, or make one of it.", EXAMPLES)
+    commands = parser.add_subparsers(required=True, metavar="command")
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("file", type=Path, metavar="FILE.xml", help="MJCF")
+    shared.add_argument(
+        "--feet", nargs="+", metavar="BODY", help="bodies that may touch the ground (default: the lowest)"
+    )
+
+    command = commands.add_parser(
+        "check", parents=[shared], help="list violations; the exit status is 1 if there are any"
+    )
+    command.set_defaults(run="check")
+    command = commands.add_parser("adapt", parents=[shared], help="strip and convert what can be")
+    command.add_argument("--name", type=_name, required=True, help="of the character, and of its files")
+    command.add_argument("--output", type=Path, default=Path(), help="folder to write to (default here)")
+    command.set_defaults(run="adapt")
+    return parser
+
+
+def _name(text: str) -> str:
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
+        raise argparse.ArgumentTypeError(f"{text!r} names a Python module, too: use small letters, digits and _")
+    return text
+
+
+if __name__ == "__main__":
+    main()
