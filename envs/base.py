@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_mcp.envs.mirror import Mirror
 from torchrl_mcp.envs.rendering import Arrow, Camera
 from torchrl_mcp.envs.simulation import LARGEST, Simulation
 
@@ -105,6 +106,19 @@ class CharacterEnv(EnvBase):
     def characters(cls) -> tuple[str, ...]:
         """Return the names of the characters that can do the task, or nothing where it does not say."""
         return ()
+
+    def mirrors(self) -> dict[str, Mirror]:
+        """Return the reflections that exchange left and right in ``observation``, ``goal`` and ``action``.
+
+        The mirror image of a transition is one of the mirrored task, with the same reward.
+
+        Raises:
+            ValueError: If the character or the task has none.
+        """
+        raise ValueError(
+            f"{type(self).__name__} has no mirror image, which symmetry needs: pass symmetry=none, or a task of biped, "
+            "humanoid or T-Rex"
+        )
 
     @property
     def physics_seconds(self) -> float:

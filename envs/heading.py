@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import heading_reward
 from torchrl_mcp.envs.transfer import TransferTask
@@ -73,6 +74,9 @@ class Heading(TransferTask):
         normalisation is not documented.
         """
         return episode_return / self.max_episode_steps
+
+    def _goal_mirror(self) -> Mirror:
+        return mirror_signs(VECTOR_SIGNS)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         drawn = self.ranges.draw(num, self.generator)

@@ -10,6 +10,7 @@ from torchrl_mcp.envs.adaptive_sampler import AdaptiveSampler
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.imitation_reward import Term, imitation_rewards, mismatch, squared_angles, squared_distances
+from torchrl_mcp.envs.mirror import Mirror, mirror_bodies
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import joint_layout
 from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
@@ -204,6 +205,9 @@ class Imitation(PDCharacterEnv):
         hard = torch.rand(num, generator=self.generator) < self.failure_weighting
         others = self._sampler.draw(num, self.generator)
         return torch.where(hard, others[0], clips), torch.where(hard, others[1], times)
+
+    def _goal_mirror(self) -> Mirror:
+        return mirror_bodies(self._bodies, repeats=NUM_TARGETS)
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         angle, place = self.heading(ids), self._positions[ids, 0]

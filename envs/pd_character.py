@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.mirror import Mirror, mirror_actions, mirror_state
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import character_state, state_layout
 from torchrl_mcp.envs.rotations import heading
@@ -107,6 +108,18 @@ class PDCharacterEnv(CharacterEnv):
     def characters(cls) -> tuple[str, ...]:
         """See :meth:`CharacterEnv.characters`: all that are known."""
         return tuple(CHARACTERS)
+
+    def mirrors(self) -> dict[str, Mirror]:
+        """See :meth:`CharacterEnv.mirrors`."""
+        return {
+            "observation": mirror_state(self._bodies),
+            "goal": self._goal_mirror(),
+            "action": mirror_actions(self.simulation.model),
+        }
+
+    def _goal_mirror(self) -> Mirror:
+        """Return the reflection of ``goal``."""
+        return super().mirrors()["goal"]
 
     def heading(self, ids: Tensor | slice = ALL) -> Tensor:
         """Direction that characters face, in radians from the world's x axis, shape ``(n,)``, float64."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.rendering import Arrow
@@ -120,6 +121,9 @@ class Transport(TransferTask):
         normalisation is not documented.
         """
         return episode_return / self.max_episode_steps
+
+    def _goal_mirror(self) -> Mirror:
+        return mirror_signs([sign for size in self._shown.values() for sign in BODY_SIGNS[:size]])
 
     def success(self) -> Tensor:
         """Whether the object is at the target, shape ``(N,)``, bool."""

@@ -29,8 +29,10 @@ class OptionAdvantages:
     :math:`\lambda = 0` these are the one-step estimates of Bacon et al. An episode that terminated has no value beyond
     its end and no option to end; one that is cut off by a time limit or the end of the batch goes on.
 
-    Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`; the termination
-    advantage is in units of the reward itself, in which :math:`\xi` is given.
+    Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`, so that values have the
+    size of a reward. So has the termination advantage with ``regret_per_step``: :math:`\xi` is then what the option to
+    change is worth, as a share of the reward of a step. Else it is in units of returns, :math:`1 / (1 - \gamma)` times
+    as large.
 
     Args:
         critic: From ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
@@ -39,6 +41,7 @@ class OptionAdvantages:
         clip: Largest absolute advantage of an action after normalisation to zero mean and unit variance.
         epsilon: Probability of a random choice in the policy over options, :math:`\pi_\Omega`.
         termination_cost: :math:`\xi`, which keeps options from ending at every step.
+        regret_per_step: Whether the termination advantage is in units of rewards, or of returns.
 
     Reference:
         Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017. https://arxiv.org/abs/1609.05140
@@ -55,10 +58,12 @@ class OptionAdvantages:
         clip: float,
         epsilon: float,
         termination_cost: float,
+        regret_per_step: bool,
     ) -> None:
         self.critic = critic
         self.reward_scale, self.clip = 1 - gamma, clip
         self.epsilon, self.termination_cost = epsilon, termination_cost
+        self.regret_scale = 1.0 if regret_per_step else 1 / self.reward_scale
         self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
     @torch.no_grad()
@@ -83,7 +88,7 @@ class OptionAdvantages:
         advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
         batch["advantage"] = advantage.clamp(-self.clip, self.clip)
         batch["value_target"] = trajectories["value_target"]
-        regret = (kept - chosen) / self.reward_scale + self.termination_cost
+        regret = (kept - chosen) * self.regret_scale + self.termination_cost
         batch["termination_advantage"] = regret * ~batch["next", "terminated"]
         return batch
 
