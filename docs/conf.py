@@ -13,6 +13,7 @@ project_copyright = "the torchrl-mcp authors"
 release = version = torchrl_mcp.__version__
 
 extensions = [
+    "commands",
     "docstrings",
     "local_names",
     "repository_links",

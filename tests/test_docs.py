@@ -165,3 +165,15 @@ def test_a_module_of_your_own_checks_nothing_when_it_is_imported():
         assert code.startswith("# check.py\n") == any(word in code for word in ("assert ", "env = ", "write_text(")), (
             code
         )
+
+
+def test_the_page_of_commands_has_every_option_of_every_command(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "_extensions")
+    pytest.importorskip("sphinx", reason="sphinx is not installed: make docs installs it")
+    page = importlib.import_module("commands").page()
+    for name, module in (("export", "--onnx FILE"), ("motions import", "--mirror"), ("play", "--viewer {web,window}")):
+        _, _, section = page.partition(f"torchrl-mcp-{name}\n")
+        assert f"`{module}`" in section.partition("\n## ")[0]
+    for module in sorted((PACKAGES["torchrl_mcp"] / "cli").glob("*.py")):
+        for option in re.findall(r'add_argument\(\s*"(?:-\w+", ")?(--[\w-]+)"', module.read_text()):
+            assert option == "--version" or option in page, option

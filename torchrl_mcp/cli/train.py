@@ -70,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
 def choices(group: str) -> list[str]:
     """Return the choices of a group of settings."""
     names = (file.name for file in files("torchrl_mcp.conf").joinpath(group).iterdir())
-    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml") and name != "base.yaml")
 
 
 def _epilog() -> str:

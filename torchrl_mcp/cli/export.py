@@ -1,0 +1,58 @@
+"""``torchrl-mcp-export``: a trained policy for other programs, as ONNX or for ``torch.export.load``."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.runs.builtin import locate
+
+PROGRAM = "torchrl-mcp-export"
+
+EXAMPLES = f"""\
+The program takes observation and goal, as the environment gives them, and returns the deterministic action.
+
+examples:
+  {PROGRAM} builtin:humanoid --onnx humanoid.onnx   # needs pip install 'torchrl-mcp[onnx]'
+  {PROGRAM} runs/my-run --torch my-run.pt2          # needs torch alone
+"""
+
+
+def main() -> None:
+    """Write the policy, and say how well the program agrees with it."""
+    options = parser()
+    arguments = options.parse_args()
+    if arguments.onnx is None and arguments.torch is None:
+        options.error("say what to write: --onnx FILE, --torch FILE, or both")
+    try:
+        path = locate(arguments.checkpoint)
+        announce(PROGRAM)
+        from torchrl_mcp.runs import export
+
+        policy, states = export.example(path)
+        if arguments.torch:
+            export.write_torch(policy, states, arguments.torch)
+            print(arguments.torch)
+        if arguments.onnx:
+            difference = export.write_onnx(policy, states, arguments.onnx)
+            checked = "not checked: onnxruntime is not installed"
+            print(arguments.onnx, checked if difference is None else f"differs from torch by at most {difference:.0e}")
+    except ValueError as error:
+        sys.exit(f"{PROGRAM}: {error}")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Write a trained policy for other programs, with its normalisers.", EXAMPLES)
+    parser.add_argument(
+        "checkpoint",
+        metavar="CHECKPOINT",
+        help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER",
+    )
+    parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")
+    parser.add_argument("--torch", type=Path, metavar="FILE", help="write a program for torch.export.load")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

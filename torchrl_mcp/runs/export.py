@@ -1,0 +1,114 @@
+"""Deterministic policies for other programs: ONNX, and ``torch.export``."""
+
+import warnings
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp.runs import experiment
+from torchrl_mcp.training.run_folder import replacing
+
+INPUTS = ("observation", "goal")
+
+
+class DeterministicPolicy(nn.Module):
+    """A policy from plain tensors to its deterministic action, input normalisers included.
+
+    Args:
+        policy: From the keys ``observation`` and ``goal`` to ``action``.
+
+    Raises:
+        ValueError: If the policy reads anything else, such as the option that an environment remembers.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        if others := [str(key) for key in policy.in_keys if key not in INPUTS]:
+            raise ValueError(
+                f"the policy also reads {', '.join(others)}, which an environment remembers between steps: only "
+                f"policies of {' and '.join(INPUTS)} can be exported"
+            )
+        self.policy = policy
+
+    def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
+        """Return the action ``(N, A)`` for observations ``(N, S)`` and goals ``(N, G)``."""
+        state = TensorDict({"observation": observation, "goal": goal}, batch_size=observation.shape[:-1])
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return self.policy(state)["action"]
+
+
+def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor]]:
+    """Return the policy of a run, and observations and goals for it, ``(num, S)`` and ``(num, G)``.
+
+    Args:
+        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        num: Number of states.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the policy is of another kind.
+    """
+    _, agent, env = experiment.restore(path, num_envs=num, seed=0)
+    state = env.reset()
+    return DeterministicPolicy(agent.actor.policy).eval(), (state["observation"], state["goal"])
+
+
+def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> ExportedProgram:
+    """Return a policy as a program of tensor operations, for any number of states at a time.
+
+    Args:
+        policy: The policy.
+        states: Observations and goals to trace it with, of at least two states.
+    """
+    batch = Dim("batch")
+    with torch.no_grad():
+        return torch.export.export(policy, states, dynamic_shapes=({0: batch}, {0: batch}))
+
+
+def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> None:
+    """Write a policy for ``torch.export.load``, which needs torch alone."""
+    with replacing(path) as partial:
+        torch.export.save(export(policy, states), partial)
+
+
+def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:
+    """Write a policy as ONNX, inputs ``observation`` and ``goal``, output ``action``; check it if onnxruntime is there.
+
+    Returns:
+        The largest difference to torch's actions in ``states``, or None without onnxruntime.
+
+    Raises:
+        ValueError: If onnx or onnxscript is not installed.
+    """
+    try:
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"{path} needs onnx and onnxscript: pip install 'torchrl-mcp[onnx]'") from error
+    with replacing(path) as partial, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch's exporter about itself
+        torch.onnx.export(
+            export(policy, states),
+            f=partial,
+            input_names=list(INPUTS),
+            output_names=["action"],
+            external_data=False,
+            verbose=False,
+        )
+    return onnx_difference(policy, states, path)
+
+
+def onnx_difference(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:
+    """Return the largest difference between the actions of torch and of onnxruntime, None if that is not installed."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return None
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    feed = dict(zip(INPUTS, (state.numpy() for state in states), strict=True))
+    (actions,) = session.run(["action"], feed)
+    with torch.no_grad():
+        return float((policy(*states) - torch.from_numpy(actions)).abs().max())
