@@ -21,7 +21,9 @@ DOCS = ROOT / "docs"
 OWN_TESTS = {"character"}
 """Tutorials whose commands write what others need: test_own_character.py."""
 TUTORIALS = [
-    path for path in (DOCS / "index.md", *sorted((DOCS / "tutorials").glob("*.md"))) if path.stem not in OWN_TESTS
+    path
+    for path in (DOCS / "index.md", DOCS / "guide.md", *sorted((DOCS / "tutorials").glob("*.md")))
+    if path.stem not in OWN_TESTS
 ]
 PACKAGES = {"torchrl_mcp": ROOT / "torchrl_mcp", "torchrl_mcp.envs": ROOT / "envs"}
 
@@ -113,7 +115,7 @@ def configurations():
     return [composed(choices) for choices in EVERYTHING]
 
 
-@pytest.mark.parametrize("page", ["silent", "differences"])
+@pytest.mark.parametrize("page", ["decisions", "differences"])
 def test_every_setting_that_a_table_names_is_in_the_configuration(page, configurations):
     rows = [row.strip("|").split("|") for row in (DOCS / f"{page}.md").read_text().splitlines() if row.startswith("| ")]
     names = {name for row in rows for name in re.findall(r"`(\+?[\w.]+)`", row[-1])}

@@ -8,9 +8,10 @@ from typing import Any
 from sphinx.application import Sphinx
 
 PAGES = {
-    "../README.md": "/performance.md",
+    "../README.md": "/index.md",
     "../benchmarks/README.md": "/performance.md",
     "../CONTRIBUTING.md": "/contributing.md",
+    "../docs/performance.md": "/performance.md",
     "../CHANGELOG.md": "/changelog.md",
 }
 """Where each of them is shown, relative to this folder."""
