@@ -29,7 +29,7 @@ PACKAGES = {"torchrl_mcp": ROOT / "torchrl_mcp", "torchrl_mcp.envs": ROOT / "env
 
 BLOCK = re.compile(r"^```(python|pycon)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"^```\{code-block\} \w+\n:caption: (.*?)\n\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-COMMAND = re.compile(r"^(?:PYTHONPATH=\. )?torchrl-mcp-train (.*)$", re.MULTILINE)
+COMMAND = re.compile(r"^(?:PYTHONPATH=\. )?torchrl-mcp-train ((?:.*\\\n)*.*)$", re.MULTILINE)
 INCLUDE = re.compile(r"```\{include\} (\S+)\n(.*?)```", re.DOTALL)
 
 EVERYTHING = (
@@ -54,8 +54,9 @@ def pages_with(pattern):
 
 def composed(arguments):
     """The configuration that a command would run, the first of several; Hydra refuses what does not exist."""
-    words = [word for word in shlex.split(arguments, comments=True) if not word.startswith("hydra")]
-    overrides = [re.sub(r"(?<==)([\w.]+),.*", r"\1", word) for word in words if "=" in word]
+    line = arguments.replace("\\\n", " ")
+    words = [word for word in shlex.split(line, comments=True) if not word.startswith("hydra")]
+    overrides = [re.sub(r"(?<==)(?:choice\()?([\w.-]+),.*", r"\1", word) for word in words if "=" in word]
     if of_own_files(arguments):
         overrides.append(f"hydra.searchpath=[file://{Path('own').absolute()}]")
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
