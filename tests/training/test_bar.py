@@ -65,6 +65,14 @@ def test_without_a_terminal_there_is_a_plain_line_every_minute(clock):
     assert re.search(r"492 steps/s, 29 min left, return 0.500", lines[0])
 
 
+def test_a_minute_without_a_step_is_a_line_that_says_so(clock):
+    log = io.StringIO()
+    with TrainingBar(1000, file=log) as bar:
+        clock[0] = 61
+        bar.advance(0, math.nan)
+    assert log.getvalue() == "0 of 1,000 steps, 0 steps/s\n"
+
+
 def test_what_is_not_wanted_is_not_shown(clock):
     log = io.StringIO()
     with TrainingBar(100, shown=False, file=log) as bar:

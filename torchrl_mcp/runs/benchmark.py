@@ -2,8 +2,8 @@
 
 A benchmark is a file of rows and settings, which are expanded to runs and handed to the configured launcher in batches
 of all that is ready: first pre-training and what needs none, then transfer (Hydra's own sweepers know of no run that
-waits for another). A run is its folder, whose configuration says what it is. Re-running a benchmark skips finished runs,
-resumes the others, and refuses a folder of other settings.
+waits for another). A run is its folder, whose configuration says what it is. Re-running a benchmark skips finished
+runs, resumes the others, and refuses a folder of other settings.
 """
 
 import sys

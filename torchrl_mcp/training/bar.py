@@ -64,6 +64,6 @@ class TrainingBar:
 
     def _line(self, shown: str) -> str:
         speed = (self._done - self._first) / (self._told - self._began)
-        minutes = max(self._total - self._done, 0) / speed / 60
-        parts = [f"{self._done:,} of {self._total:,} steps", f"{speed:,.0f} steps/s", f"{minutes:.0f} min left", shown]
+        left = f"{max(self._total - self._done, 0) / speed / 60:.0f} min left" if speed else ""
+        parts = [f"{self._done:,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, shown]
         return ", ".join(filter(None, parts))
