@@ -115,12 +115,47 @@ def test_self_collision_is_a_switch():
     assert contacts[1] > 0
 
 
+def drift(character, friction_cone, angle, steps=12):
+    """How far the bodies of a motion and of the same motion turned about z are apart in the end, in metres."""
+    env = make(character, 2, friction_cone=friction_cone, terminate_on_fall=False)
+    env.reset()
+    state, turn = env.get_state(), Rotation.from_euler("z", angle)
+    generator = torch.Generator().manual_seed(0)
+    state["qvel"][:] = 0.3 * torch.randn(state["qvel"].shape[1], generator=generator, dtype=torch.float64)
+    state["qvel"][:, 0] += 0.5
+    state["qpos"][:, 2] += 0.005  # where no two corners of a foot touch at once: rounding would choose between them
+    for part in (state["qpos"], state["qvel"]):
+        part[1, :3] = torch.from_numpy(turn.apply(part[1, :3].numpy()))
+    root = Rotation.from_quat(state["qpos"][1, 3:7].numpy(), scalar_first=True)
+    state["qpos"][1, 3:7] = torch.from_numpy((turn * root).as_quat(scalar_first=True))
+    carrier, contacts = env.reset(state, set_state=True), 0
+    for _ in range(steps):
+        action = 0.4 * torch.rand(env.action_spec.shape[-1], generator=generator) - 0.2
+        carrier = env.step(carrier.set("action", action.expand(2, -1)))["next"]
+        contacts += env.simulation.data(0).ncon
+    assert contacts, "in the air, friction has no part"
+    here, there = env.simulation.outputs["xpos"][:, 1:].numpy()
+    return np.linalg.norm(turn.inv().apply(there) - here, axis=-1).max()
+
+
+@every_character
+@pytest.mark.parametrize("angle", [math.pi / 4, 0.3])
+def test_with_elliptic_cones_the_world_has_no_axes(character, angle):
+    assert drift(character, "elliptic", angle) < 1e-9
+
+
+def test_pyramidal_cones_have_edges_along_the_axes():
+    assert drift("biped", "pyramidal", math.pi / 4) > 1e-3
+    assert drift("biped", "pyramidal", math.pi / 2) < 1e-9
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"character": "ant"}, "character='ant' is unknown: pass one of biped, humanoid, trex"),
         ({"physics_timestep": 0.007}, "physics_timestep=0.007 does not divide the control step"),
         ({"physics_timestep": 0.1}, "physics_timestep=0.1 does not divide the control step"),
+        ({"friction_cone": "round"}, "friction_cone='round' is unknown: pass one of pyramidal, elliptic"),
         ({"num_envs": 0}, "num_envs=0"),
     ],
 )

@@ -48,6 +48,7 @@ OTHER = {
     "max_episode_steps": 7,
     "terminate_on_fall": False,
     "self_collision": True,
+    "friction_cone": "elliptic",
     "physics_timestep": 1 / 240,
     "contact_forces": True,
     "forward_weight": 2.0,
