@@ -12,6 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_mcp.envs.mirror import Mirror
+from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.rendering import Arrow, Camera
 from torchrl_mcp.envs.simulation import LARGEST, Simulation
 
@@ -119,6 +120,13 @@ class CharacterEnv(EnvBase):
             f"{type(self).__name__} has no mirror image, which symmetry needs: pass symmetry=none, or a task of biped, "
             "humanoid or T-Rex"
         )
+
+    def reach(self) -> Reach | None:
+        """Returns of who stands still and of an ideal player, from the beginnings of the episodes just begun.
+
+        None where a task does not say.
+        """
+        return None
 
     @property
     def physics_seconds(self) -> float:

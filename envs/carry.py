@@ -68,6 +68,8 @@ class Carry(Transport):
         torch.Size([2, 3, 27])
     """
 
+    success_distance = TOP_HALF_SIZE
+
     def __init__(self, character: str, num_envs: int, **kwargs: Any) -> None:
         super().__init__(
             character,

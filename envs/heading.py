@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.rendering import Arrow
+from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.rewards import heading_reward
 from torchrl_mcp.envs.transfer import TransferTask
 
@@ -77,6 +78,12 @@ class Heading(TransferTask):
 
     def _goal_mirror(self) -> Mirror:
         return mirror_signs(VECTOR_SIGNS)
+
+    def reach(self) -> Reach:
+        """See :meth:`CharacterEnv.reach`: the ideal player walks at the target speed, wherever to, from the first step."""
+        still = torch.zeros(self.num_envs, 2, dtype=torch.float64)
+        standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
+        return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         drawn = self.ranges.draw(num, self.generator)

@@ -11,6 +11,7 @@ from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
 from torchrl_mcp.envs.rendering import Arrow
+from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.rewards import holdout_reward
 
 # Ant-v5's frame_skip, main_body and contact_force_range.
@@ -136,10 +137,20 @@ class Holdout(CharacterEnv):
         with :math:`R` the undiscounted return, :math:`T` ``max_episode_steps`` and :math:`r^*` the reward per step at
         Gymnasium's ``reward_threshold`` for Ant-v5. The paper's normalisation is not documented.
         """
+        return episode_return / self._solved()
+
+    def _solved(self) -> float:
         spec = gymnasium.spec("Ant-v5")
         assert spec.reward_threshold is not None
         assert spec.max_episode_steps is not None
-        return episode_return / (self.max_episode_steps * spec.reward_threshold / spec.max_episode_steps)
+        return self.max_episode_steps * spec.reward_threshold / spec.max_episode_steps
+
+    def reach(self) -> Reach:
+        """See :meth:`CharacterEnv.reach`: a reward without a ceiling, of which 1 is taken that Gymnasium calls solved."""
+        still = torch.zeros(self.num_envs, 2)
+        action, healthy = torch.zeros(self.num_envs, self.simulation.model.nu), torch.ones(self.num_envs)
+        standing = self.max_episode_steps * self._reward(still, self.episode["goal"], action, healthy)
+        return Reach(standing, torch.full_like(standing, self._solved()))
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         model, noise, source = self.simulation.model, self.reset_noise_scale, self.generator

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
+from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.rendering import Arrow
@@ -64,6 +65,8 @@ class Transport(TransferTask):
     """
 
     distances = ("object", "target")
+    success_distance = SUCCESS_DISTANCE
+    """Metres between object and target at which an ideal player has succeeded."""
 
     def __init__(
         self,
@@ -87,7 +90,7 @@ class Transport(TransferTask):
         not_negative(speed=speed)
         if target_distance_power not in (1, 2):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
-        self.success_reward = success_reward
+        self.success_reward, self.speed = success_reward, speed
         self.goal_layout = goal_layout(things)
         """Where to find each quantity in ``goal``, by name."""
         self._shown = dict(things)
@@ -124,6 +127,22 @@ class Transport(TransferTask):
 
     def _goal_mirror(self) -> Mirror:
         return mirror_signs([sign for size in self._shown.values() for sign in BODY_SIGNS[:size]])
+
+    def reach(self) -> Reach:
+        """See :meth:`CharacterEnv.reach`."""
+
+        def reward(*state: Tensor) -> Tensor:
+            left = torch.linalg.vector_norm(state[2] - state[4], dim=-1)
+            succeeded = (left < self.success_distance) & self.success_reward
+            return self._reward(*state).masked_fill(succeeded, 1.0)
+
+        return transport_reach(
+            reward,
+            *(part[:, :2].clone() for part in (self._com, self._object, self._target)),
+            speed=self.speed,
+            timestep=self.control_timestep,
+            num_steps=self.max_episode_steps,
+        )
 
     def success(self) -> Tensor:
         """Whether the object is at the target, shape ``(N,)``, bool."""
