@@ -10,6 +10,7 @@ from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import heading_reward
 from torchrl_mcp.envs.transfer import TransferTask
 
@@ -80,7 +81,7 @@ class Heading(TransferTask):
         return mirror_signs(VECTOR_SIGNS)
 
     def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`: the ideal player walks at the target speed, wherever to, from the first step."""
+        """See :meth:`CharacterEnv.reach`: who is ideal walks at the target speed from the first step on."""
         still = torch.zeros(self.num_envs, 2, dtype=torch.float64)
         standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
         return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
-from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import holdout_reward
 
 # Ant-v5's frame_skip, main_body and contact_force_range.
@@ -146,7 +146,7 @@ class Holdout(CharacterEnv):
         return self.max_episode_steps * spec.reward_threshold / spec.max_episode_steps
 
     def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`: a reward without a ceiling, of which 1 is taken that Gymnasium calls solved."""
+        """See :meth:`CharacterEnv.reach`: the ideal is what Gymnasium calls solved, which is no ceiling."""
         still = torch.zeros(self.num_envs, 2)
         action, healthy = torch.zeros(self.num_envs, self.simulation.model.nu), torch.ones(self.num_envs)
         standing = self.max_episode_steps * self._reward(still, self.episode["goal"], action, healthy)

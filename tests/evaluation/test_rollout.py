@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from typing import ClassVar
 
 import pytest
@@ -11,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal
 
 from torchrl_mcp.envs import Holdout
+from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.evaluation.rollout import Evaluation, episode_statistics, evaluate
 
 
@@ -199,6 +201,23 @@ def test_the_statistics_of_four_episodes_by_hand():
             "episodes": 4,
         }
     )
+
+
+def test_the_place_of_returns_lies_between_those_of_standing_still_and_an_ideal_player():
+    outcome = replace(
+        episodes([1.0, 2.0], [1, 2], [True, False]), reach=Reach(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 3.0]))
+    )
+    numbers = episode_statistics(outcome, lambda returns: returns / 10)
+    assert numbers["reach"] == pytest.approx({"place": (1.5 - 0.5) / (3.5 - 0.5), "standing": 0.05, "ideal": 0.35})
+
+
+def test_an_ant_that_does_nothing_is_where_standing_still_is():
+    idle = TensorDictModule(lambda state, goal: state.new_zeros(len(state), 8), ["observation", "goal"], ["action"])
+    env = ants(reset_noise_scale=0.0, max_episode_steps=200)
+    numbers = episode_statistics(evaluate(idle, env), env.normalised_return)
+    assert numbers["reach"]["standing"] == pytest.approx(1 / 6)
+    assert numbers["reach"]["ideal"] == 1
+    assert numbers["reach"]["place"] == pytest.approx(0, abs=0.03)
 
 
 def test_the_interval_is_that_of_normal_theory_for_many_episodes():

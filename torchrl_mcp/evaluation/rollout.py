@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
+from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.transfer import task_reward
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.evaluation.statistics import mean
@@ -27,6 +28,7 @@ class Evaluation:
         metrics: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
             as ``success``; of a number, its mean over the steps, as ``tracking_error``.
         decisions: What was recorded of the policy, of all steps of all episodes, batch size ``(M,)``.
+        reach: Returns of who stands still and of an ideal player in the same episodes, if the task says.
     """
 
     returns: Tensor
@@ -35,6 +37,7 @@ class Evaluation:
     positions: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
     decisions: TensorDictBase = field(default_factory=TensorDict)
+    reach: Reach | None = None
 
 
 @torch.no_grad()
@@ -61,6 +64,7 @@ def evaluate(
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     state = env.reset() if start is None else env.reset(start, set_state=True)
+    reach = env.reach() if hasattr(env, "reach") else None
     running = torch.ones(env.batch_size, dtype=torch.bool)
     returns = torch.zeros(env.batch_size)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
@@ -96,7 +100,7 @@ def evaluate(
         for key, values in (flags | means).items()
         for name, value in zip(names[key], values.unbind(-1), strict=True)
     }
-    return Evaluation(returns, lengths, terminated, torch.stack(positions), metrics, torch.cat(decisions))
+    return Evaluation(returns, lengths, terminated, torch.stack(positions), metrics, torch.cat(decisions), reach)
 
 
 def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor]) -> dict[str, Any]:
@@ -108,16 +112,22 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``metrics``), the standard deviation over episodes (0 of a single one), and a 95 % percentile
-        bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
+        fraction, ``metrics``; where the task says, ``reach``: the returns ``standing`` and ``ideal``, and the
+        ``place`` between them, from 0 to 1), the standard deviation over episodes (0 of a single one), and a 95 %
+        percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
     """
     normalised = normalised_return(outcome.returns)
     estimate = mean(normalised.tolist())
     single = len(normalised) == 1
+    reach = {}
+    if outcome.reach is not None:
+        ends = {name: normalised_return(returns).mean().item() for name, returns in outcome.reach._asdict().items()}
+        reach = {"reach": {"place": outcome.reach.place(outcome.returns).item(), **ends}}
     return {
         "normalised_return": normalised.mean().item(),
         "normalised_return_std": 0.0 if single else normalised.std().item(),
         "interval": [estimate.value] * 2 if single else [estimate.low, estimate.high],
+        **reach,
         "return": outcome.returns.mean().item(),
         "length": outcome.lengths.float().mean().item(),
         "terminated": outcome.terminated.float().mean().item(),

@@ -60,7 +60,7 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
     return _estimate(strata, lambda values, axis: trim_mean(values, 0.25, axis=axis))
 
 
-def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str) -> dict[str, float]:
+def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[str, ...] = ()) -> dict[str, float]:
     """Return the means of what all have, by name, but for names that begin with ``left_out``."""
     shared = [name for name in (numbers[0] if numbers else {}) if all(name in other for other in numbers)]
     kept = [name for name in shared if not name.startswith(left_out)]

@@ -116,6 +116,11 @@ class Cell:
         return shared_means([run.evaluation["deterministic"].get("metrics", {}) for run in self.complete], "reward_")
 
     @property
+    def reach(self) -> dict[str, float]:
+        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes, where the task says."""
+        return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
+
+    @property
     def remarks(self) -> list[str]:
         """What a reader should know before trusting its numbers."""
         standings = _grouped((run for run in self.runs if run.state != "complete"), _standing)

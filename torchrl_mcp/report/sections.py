@@ -127,6 +127,11 @@ class Section:
         """Whether the paper has a figure for one of them."""
         return any(row.cell.reported for row in self.rows)
 
+    @property
+    def has_reach(self) -> bool:
+        """Whether one of them has a place between standing still and an ideal player."""
+        return any(row.cell.reach for row in self.rows)
+
     def is_best(self, cell: Cell, mode: str) -> bool:
         """Whether a cell has the highest mean of at least two."""
         means = [estimate.value for row in self.rows if (estimate := row.cell.mean(mode))]
