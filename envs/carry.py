@@ -115,8 +115,8 @@ class Carry(Transport):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "taken": torch.zeros(len(ids))}
 
-    def _task_reward(self) -> Tensor:
-        reward = super()._task_reward()
+    def _rewards(self) -> Tensor:
+        rewards = super()._rewards()
         touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
         closing = self._over(touching, "source", RESTING_GAP)
         opening = self._over(self._joined == 1, "target", RELEASE_GAP)
@@ -124,7 +124,7 @@ class Carry(Transport):
             self._joint[closing] = relative_pose(*(part[closing] for part in (*self._carrier, *self._box)))
             self._joined[closing] = self.episode["taken"][closing] = 1
         self._joined[opening] = 0
-        return reward
+        return rewards
 
     def success(self) -> Tensor:
         """Whether the box was taken, is held no more and stands on the target, shape ``(N,)``, bool."""

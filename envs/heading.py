@@ -94,11 +94,11 @@ class Heading(TransferTask):
         angle = self.heading(ids)
         return {"observation": self._state(ids, angle), "goal": unit_vector(self.episode["direction"][ids] - angle)}
 
-    def _task_reward(self) -> Tensor:
+    def _rewards(self) -> Tensor:
         direction = self.episode["direction"]
         reward = heading_reward(self._com_velocity(), unit_vector(direction), self.speed)
         direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
-        return reward
+        return reward.unsqueeze(0)
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""

@@ -147,7 +147,7 @@ class PDCharacterEnv(CharacterEnv):
         return velocity
 
     def _unless_fallen(self, reward: Tensor) -> tuple[Tensor, Tensor]:
-        """The reward, or 0 after a fall, and whether the fall ends the episode, ``(N,)`` each."""
+        """Rewards ``(*R, N)``, or 0 after a fall, and whether the fall ends the episode, ``(N,)``."""
         fallen = self.fallen()
         return reward.masked_fill(fallen, 0.0), fallen & self.terminate_on_fall
 

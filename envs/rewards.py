@@ -1,5 +1,7 @@
 """Rewards of the paper's tasks, as functions of tensors."""
 
+import math
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -81,7 +83,7 @@ def transport_reward(
     velocity: Tensor,
     target: Tensor,
     *,
-    weights: tuple[float, float, float, float],
+    weights: Sequence[float],
     proximity_scale: float,
     speed: float,
     target_distance_power: float,
@@ -122,6 +124,18 @@ def transport_reward(
     (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
     exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
     return exponents.exp() @ exponents.new_tensor(weights)
+
+
+def idle_reward(weights: Sequence[float], speed: float) -> float:
+    r"""What the speeds in :func:`transport_reward` earn while nothing moves.
+
+    .. math:: w^{cv} \exp(-1.5 \hat{v}^2) + w^{bv} \exp(-\hat{v}^2)
+
+    Args:
+        weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
+        speed: Target speed :math:`\hat{v}`, in m/s.
+    """
+    return weights[0] * math.exp(-1.5 * speed**2) + weights[2] * math.exp(-(speed**2))
 
 
 carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)

@@ -18,11 +18,11 @@ from torchrl_mcp.envs.ranges import Ranges
 from torchrl_mcp.envs.shaping import Ramp, potential, shaping_reward
 
 TASK_REWARD = "task_reward"
-"""Key under which environments with shaping show the reward without it."""
+"""Key under which environments that let training learn from another reward show the task's own."""
 
 
 def task_reward(outcome: TensorDictBase) -> Tensor:
-    """The task's own reward of steps, whether or not training shapes what it learns from, ``(*B, 1)``.
+    """The task's own reward of steps, whether or not training learns from another, ``(*B, 1)``.
 
     Args:
         outcome: What an environment says after its steps, batch size ``(*B,)``.
@@ -33,8 +33,8 @@ def task_reward(outcome: TensorDictBase) -> Tensor:
 class TransferTask(PDCharacterEnv):
     """A task for characters that can walk, and what training on it may use: by default nothing of it.
 
-    Episodes may begin in motion, and in easier places than those of the task. Shaping adds rewards for progress, and
-    ``task_reward`` (1) then shows the task's own reward of the step beside the ``reward`` that is learnt from.
+    Episodes may begin in motion, and in easier places than those of the task. What is learnt from may be another
+    reward, and shaping may add rewards for progress; ``task_reward`` (1) then shows the task's own beside ``reward``.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -47,6 +47,9 @@ class TransferTask(PDCharacterEnv):
         shaping: ``slope`` and ``reach`` of the :func:`~torchrl_mcp.envs.shaping.potential` by the names of the task's
             distances; none for no shaping. A fallen character has no potential.
         discount: Of the learner, for shaping.
+        staggered: Cut the first episodes short, each by another length, so that simulations are never all at the same
+            moment of an episode: a batch of short trajectories would show that moment alone.
+        practised: Whether the task lets training learn from another reward than its own.
         episode: What the task remembers of one simulation at first.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -68,6 +71,8 @@ class TransferTask(PDCharacterEnv):
         motions: MotionLibrary | Mapping[str, MotionClip] | None = None,
         shaping: Mapping[str, Mapping[str, float]] | None = None,
         discount: float = 0.99,
+        staggered: bool = False,
+        practised: bool = False,
         episode: Mapping[str, Tensor],
         **kwargs: Any,
     ) -> None:
@@ -80,8 +85,9 @@ class TransferTask(PDCharacterEnv):
         if not 0 < discount <= 1:
             raise ValueError(f"discount={discount} is out of range: pass the learner's, above 0 and at most 1")
         self.shaping, self.discount = ramps, discount
-        zero = torch.zeros((), dtype=torch.float64)
-        remembered = {"potential": zero, TASK_REWARD: zero} if self.shaping else {}
+        self.staggered, self._practised = staggered, practised or bool(ramps)
+        names = [*(["potential"] if ramps else []), *([TASK_REWARD] if self._practised else [])]
+        remembered = {name: torch.zeros((), dtype=torch.float64) for name in names}
         super().__init__(character, num_envs, episode={**remembered, **episode}, **kwargs)
         self.beginnings = Beginnings(character, initial_states, motions)
 
@@ -93,20 +99,26 @@ class TransferTask(PDCharacterEnv):
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         begun = super()._begin(ids)
+        if self._practised:
+            begun[TASK_REWARD] = torch.zeros(len(ids))
         if self.shaping:
-            begun |= {"potential": self._potential(ids), TASK_REWARD: torch.zeros(len(ids))}
+            begun["potential"] = self._potential(ids)
+        if self.staggered and len(ids) == self.num_envs:
+            begun["elapsed_steps"] = (ids * self.max_episode_steps // self.num_envs).unsqueeze(-1)
         return begun
 
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         observed = self._show(ids)
-        if self.shaping:
+        if self._practised:
             observed[TASK_REWARD] = self.episode[TASK_REWARD][ids].unsqueeze(-1)
         return observed
 
     def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        reward, terminated = self._unless_fallen(self._task_reward())
+        rewards, terminated = self._unless_fallen(self._rewards())
+        reward = rewards[-1]
+        if self._practised:
+            self.episode[TASK_REWARD].copy_(rewards[0])[diverged] = 0.0
         if self.shaping:
-            self.episode[TASK_REWARD].copy_(reward)[diverged] = 0.0
             before = self.episode["potential"].clone()
             after = self.episode["potential"].copy_(self._potential(ALL))
             reward = reward + shaping_reward(before, after, self.discount)
@@ -126,5 +138,8 @@ class TransferTask(PDCharacterEnv):
         """See :meth:`CharacterEnv._observe`."""
 
     @abstractmethod
-    def _task_reward(self) -> Tensor:
-        """Reward of the step just made, unless the character has fallen, ``(N,)``, float64; updates ``episode``."""
+    def _rewards(self) -> Tensor:
+        """Rewards of the step just made, unless the character has fallen, float64; updates ``episode``.
+
+        The task's own, ``(1, N)``, or it and the one that is learnt from, ``(2, N)``.
+        """

@@ -16,6 +16,7 @@ from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.rendering import Arrow
+from torchrl_mcp.envs.rewards import idle_reward
 from torchrl_mcp.envs.transfer import TransferTask
 
 SUCCESS_DISTANCE = 0.5
@@ -54,6 +55,9 @@ class Transport(TransferTask):
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Give the reward 1 while successful.
+        emphasis: Weights of the four terms of the reward that is learnt from, of which the speeds then count from
+            standing still; None for the task's own. Of the printed reward, standing still earns a third of the best,
+            and who learns from it learns to stand.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: What the task remembers beside the object's position.
@@ -83,6 +87,7 @@ class Transport(TransferTask):
         speed: float = 1.0,
         target_distance_power: float = 2,
         success_reward: bool = False,
+        emphasis: Sequence[float] | None = None,
         max_episode_steps: int = 3000,
         episode: Mapping[str, Tensor] | None = None,
         **kwargs: Any,
@@ -95,9 +100,17 @@ class Transport(TransferTask):
         """Where to find each quantity in ``goal``, by name."""
         self._shown = dict(things)
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
+        self._emphasised, self._idle = None, 0.0
+        if emphasis is not None:
+            if len(emphasis) != 4:
+                raise ValueError(
+                    f"emphasis={list(emphasis)} has {len(emphasis)} weights: pass one for each of four terms"
+                )
+            self._emphasised, self._idle = partial(self._reward, weights=list(emphasis)), idle_reward(emphasis, speed)
         super().__init__(
             character,
             num_envs,
+            practised=emphasis is not None,
             ranges={
                 "object_distances": object_distances,
                 "object_directions": object_directions,
@@ -181,19 +194,22 @@ class Transport(TransferTask):
         ways = {"object": thing - com, "target": target - thing}
         return {name: torch.linalg.vector_norm(way, dim=-1) for name, way in ways.items()}
 
-    def _task_reward(self) -> Tensor:
+    def _rewards(self) -> Tensor:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep
         self.episode["object"].copy_(self._object)
-        reward = self._reward(
+        state = (
             self._com[:, :2],
             self._com_velocity(),
             self._object[:, :2],
             object_velocity[:, :2],
             self._target[:, :2],
         )
+        reward = self._reward(*state)
         if self.success_reward:
             reward = reward.masked_fill(self.success(), 1.0)
-        return reward
+        if self._emphasised is None:
+            return reward.unsqueeze(0)
+        return torch.stack([reward, self._emphasised(*state) - self._idle])
 
     def arrows(self, index: int) -> list[Arrow]:
         """From above the character to the object, and from above the object to the target."""

@@ -41,6 +41,8 @@ OTHER = {
     "mixture": [{"weight": 2.0}],
     "shaping": {"object": {"slope": 1.0, "reach": 4.0}},
     "discount": 0.5,
+    "staggered": True,
+    "emphasis": [0.6, 0.1, 1.0, 0.5],
     "max_turn": 0.5,
     "speed": 2.0,
     "target_distance_power": 1,
@@ -96,7 +98,18 @@ def trained_otherwise(task):
 def test_an_evaluation_says_every_setting_of_its_environment(task):
     cfg = configure(task)
     arguments = build.arguments(cfg.task[STAGES[task]]._target_)
-    inside = {"things", "furnish", "reward", "ranges", "episode", "model", "substeps", "outputs", "model_fields"}
+    inside = {
+        "practised",
+        "things",
+        "furnish",
+        "reward",
+        "ranges",
+        "episode",
+        "model",
+        "substeps",
+        "outputs",
+        "model_fields",
+    }
     settings = arguments.keys() - NO_SETTINGS - inside - {"persistent", "current"}
     assert evaluated_as(cfg).keys() == settings
 
@@ -126,14 +139,14 @@ def test_what_training_uses_would_make_another_evaluation(task):
             assert trained[name] != value, name
 
 
-@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping"])
+@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping", "emphasis"])
 @pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
 def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):
     cfg = configure(task, f"practice={practice}")
     assert evaluated_as(cfg) == evaluated_as(configure(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
-    shaped = practice == "shaping" and task != "heading"
-    assert ("task_reward" in env.rollout(2)["next"]) == shaped
+    another = practice in ("shaping", "emphasis") and task != "heading"
+    assert ("task_reward" in env.rollout(2)["next"]) == another
 
 
 class Push(torch.nn.Module):
