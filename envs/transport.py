@@ -55,9 +55,9 @@ class Transport(TransferTask):
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Give the reward 1 while successful.
-        emphasis: Weights of the four terms of the reward that is learnt from, of which the speeds then count from
-            standing still; None for the task's own. Of the printed reward, standing still earns a third of the best,
-            and who learns from it learns to stand.
+        emphasis: ``weights`` of the four terms and ``target_distance_power`` of the reward that is learnt from, in
+            which speeds count from standing still; None for the task's own. Of the printed reward, standing still
+            earns a third of the best, and who learns from it learns to stand.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: What the task remembers beside the object's position.
@@ -87,7 +87,7 @@ class Transport(TransferTask):
         speed: float = 1.0,
         target_distance_power: float = 2,
         success_reward: bool = False,
-        emphasis: Sequence[float] | None = None,
+        emphasis: Mapping[str, Any] | None = None,
         max_episode_steps: int = 3000,
         episode: Mapping[str, Tensor] | None = None,
         **kwargs: Any,
@@ -102,11 +102,10 @@ class Transport(TransferTask):
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
         self._emphasised, self._idle = None, 0.0
         if emphasis is not None:
-            if len(emphasis) != 4:
-                raise ValueError(
-                    f"emphasis={list(emphasis)} has {len(emphasis)} weights: pass one for each of four terms"
-                )
-            self._emphasised, self._idle = partial(self._reward, weights=list(emphasis)), idle_reward(emphasis, speed)
+            if set(emphasis) != {"weights", "target_distance_power"} or len(emphasis["weights"]) != 4:
+                raise ValueError(f"emphasis={dict(emphasis)}: pass four weights and a target_distance_power")
+            self._emphasised = partial(self._reward, **emphasis)
+            self._idle = idle_reward(emphasis["weights"], speed)
         super().__init__(
             character,
             num_envs,

@@ -42,7 +42,7 @@ OTHER = {
     "shaping": {"object": {"slope": 1.0, "reach": 4.0}},
     "discount": 0.5,
     "staggered": True,
-    "emphasis": [0.6, 0.1, 1.0, 0.5],
+    "emphasis": {"weights": [0.6, 0.1, 1.0, 0.5], "target_distance_power": 1},
     "max_turn": 0.5,
     "speed": 2.0,
     "target_distance_power": 1,
