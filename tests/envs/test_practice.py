@@ -1,0 +1,119 @@
+"""What training may use beside the task itself, and what the task's own reward then is."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_mcp.envs import Carry, Dribble, Heading
+
+EMPHASIS = {"weights": [0.6, 0.1, 1.0, 2.0], "target_distance_power": 1}
+SCALE = {Carry: 0.25, Dribble: 0.5}
+every_task = pytest.mark.parametrize("task", [Carry, Dribble])
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
+
+
+def make(task, num_envs=4, **kwargs):
+    return task("biped", num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
+
+
+def outcomes(env, num_steps=12, push=0.2):
+    """What the environment says after each step of random actions, and where all was before and after it."""
+    generator, state, seen = torch.Generator().manual_seed(0), env.reset(), []
+    for _ in range(num_steps):
+        before = places(env)
+        action = push * (2 * torch.rand(env.action_spec.shape, generator=generator) - 1)
+        state = env.step(state.set("action", action))["next"]
+        seen.append((state.clone(), before, places(env)))
+    return seen
+
+
+def places(env):
+    """Centre of mass, object and target on the ground, by MuJoCo's own names, each ``(N, 2)``."""
+    found = []
+    for index in range(env.num_envs):
+        data, model = env.simulation.data(index), env.simulation.model
+        found.append(np.array([data.subtree_com[1], data.body(model.nbody - 1).xpos, data.body("target").xpos]))
+    return np.stack(found, 1)[..., :2]
+
+
+@every_task
+def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
+    for state, before, (com, thing, target) in outcomes(make(task, emphasis=EMPHASIS, terminate_on_fall=False)):
+        ahead, left = thing - com, target - thing
+        pace = ((com - before[0]) * 30 * ahead).sum(-1) / np.linalg.norm(ahead, axis=-1)
+        progress = ((thing - before[1]) * 30 * left).sum(-1) / np.linalg.norm(left, axis=-1)
+        expected = 0.6 * (np.exp(-1.5 * np.minimum(0, pace - 1) ** 2) - math.exp(-1.5))
+        expected += 0.1 * np.exp(-SCALE[task] * (ahead**2).sum(-1))
+        expected += 1.0 * (np.exp(-(np.minimum(0, progress - 1) ** 2)) - math.exp(-1))
+        expected += 2.0 * np.exp(-0.5 * np.linalg.norm(left, axis=-1))
+        np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
+
+
+@every_task
+def test_the_task_reward_is_that_of_the_task_without_emphasis(task):
+    emphasised = outcomes(make(task, emphasis=EMPHASIS))
+    plain = outcomes(make(task))
+    for (one, *_), (other, *_) in zip(emphasised, plain, strict=True):
+        assert torch.equal(one["task_reward"], other["reward"])
+        assert "task_reward" not in other
+        assert not torch.equal(one["reward"], other["reward"])
+
+
+@every_task
+def test_who_has_fallen_earns_neither(task):
+    fell = torch.zeros(4, 1, dtype=torch.bool)
+    for state, *_ in outcomes(make(task, emphasis=EMPHASIS), 60, push=1.0):
+        ended = state["terminated"]
+        assert (state["reward"][ended] == 0).all()
+        assert (state["task_reward"][ended] == 0).all()
+        fell |= ended
+    assert fell.any()
+
+
+def test_standing_still_far_from_everything_earns_nothing():
+    far = {"object_distances": (9.0, 10.0), "target_distances": (9.0, 10.0)}
+    state = outcomes(make(Dribble, emphasis=EMPHASIS | {"target_distance_power": 2}, **far), 1, push=0.0)[0][0]
+    assert state["reward"].abs().max() < 0.03
+    assert state["task_reward"].min() > 0.1
+
+
+@pytest.mark.parametrize(
+    "emphasis", [{"weights": [1.0, 1.0, 1.0], "target_distance_power": 1}, {"weights": [1.0] * 4}, {"power": 1}]
+)
+def test_a_wrong_emphasis_is_named_with_a_remedy(emphasis):
+    with pytest.raises(ValueError, match=r"emphasis=\{.*pass four weights and a target_distance_power"):
+        make(Dribble, emphasis=emphasis)
+
+
+def lengths(env, num_steps):
+    """Lengths of the episodes that end, by simulation, of a character that stands."""
+    env.reset()
+    state, ended, last = env.reset(), [[] for _ in range(env.num_envs)], [0] * env.num_envs
+    for step in range(1, num_steps + 1):
+        outcome, state = env.step_and_maybe_reset(state.set("action", torch.zeros(env.action_spec.shape)))
+        for index in outcome["next", "truncated"].flatten().nonzero().flatten().tolist():
+            ended[index].append(step - last[index])
+            last[index] = step
+    return ended
+
+
+def test_the_first_episodes_are_cut_short_one_by_one_and_the_next_last_as_long_as_they_should():
+    env = make(Heading, 4, staggered=True, max_episode_steps=8, terminate_on_fall=False)
+    assert lengths(env, 20) == [[8, 8], [6, 8], [4, 8, 8], [2, 8, 8]]
+    assert lengths(make(Heading, 4, max_episode_steps=8, terminate_on_fall=False), 20) == [[8, 8]] * 4
+
+
+def test_a_staggered_training_goes_on_at_the_same_moments_after_it_was_interrupted():
+    env = make(Heading, 4, staggered=True, max_episode_steps=8)
+    env.step(env.reset().set("action", torch.zeros(env.action_spec.shape)))
+    saved, elapsed = env.get_extra_state(), env.episode["elapsed_steps"].clone()
+    other = make(Heading, 4, staggered=True, max_episode_steps=8)
+    other.set_extra_state(saved)
+    other.reset()
+    assert torch.equal(other.episode["elapsed_steps"], elapsed)
