@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_mcp.envs.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.mirror import Mirror
 from torchrl_mcp.envs.rendering import Arrow, Camera
 from torchrl_mcp.envs.simulation import LARGEST, Simulation
 

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
-from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
-from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import heading_reward
 from torchrl_mcp.envs.transfer import TransferTask

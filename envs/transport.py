@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
-from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach, transport_reach
+from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
 from torchrl_mcp.envs.rendering import Arrow
