@@ -140,7 +140,7 @@ def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
     assert lmbda == pytest.approx(0.95)
     assert gamma == pytest.approx(DISCOUNT[stage])
     assert (trainer.frames_per_batch, trainer.minibatch_size) == (table["Batch Size"], 256)
-    assert (trainer.num_epochs, trainer.schedule, trainer.autocast) == (1, None, False)
+    assert (trainer.num_epochs, trainer.schedule, trainer.autocast, trainer.warmup_batches) == (1, None, False, 0)
     for optimizer in trainer.optimizers.values():
         (group,) = optimizer.param_groups
         assert isinstance(optimizer, torch.optim.SGD)

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -46,7 +47,7 @@ def pretrained(tmp_path_factory):
     "overrides",
     [
         [],
-        ["method=scratch", "learned_std=true", "training.warmup_batches=2"],
+        ["method=scratch"],
         ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"],
     ],
     ids=" ".join,
@@ -87,6 +88,31 @@ def test_the_trajectory_source_is_stopped_when_a_run_fails(tmp_path, monkeypatch
     with pytest.raises(failure):
         experiment.train(configure(tmp_path / "run"))
     assert len(stopped) == 1
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["method=scratch", "task=heading", "symmetry=augment", "learned_std=true", "width=0.1"],
+        ["method=latent_space", "task=imitation", "symmetry=loss", "learned_std=true", "width=0.1"],
+    ],
+    ids=" ".join,
+)
+def test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit(tmp_path, overrides):
+    whole = tmp_path / "whole"
+    settings = [*overrides, "training.warmup_batches=2", "checkpoint_interval=1", "keep_checkpoints=9"]
+    experiment.train(configure(whole, *settings, "training.total_frames=512"))
+    for frames in (128, 256):
+        cut = tmp_path / str(frames)
+        shutil.copytree(whole, cut)
+        for path in sorted((cut / checkpoint.FOLDER).iterdir()):
+            if checkpoint.frames(path) > frames:
+                path.unlink()
+        experiment.resume(cut)
+        assert rows(cut) == rows(whole)
+        expected = final_parts(whole)
+        for name, value in final_parts(cut).items():
+            assert torch.equal(value, expected[name]), name
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pretrained):

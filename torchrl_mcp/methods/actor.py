@@ -51,6 +51,7 @@ class Actor:
         policy: What collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
         trained: What the loss differentiates: gives the distribution of ``sampled`` from a stored sample.
         stored: Keys, beside the environment's own, that a sample must hold for the loss and the diagnostics.
+        drawn: Those of ``stored`` that are drawn at random, rather than computed of ``observation`` and ``goal``.
         sampled: Key of the random variable whose log-probability the policy gradient takes.
     """
 
@@ -58,6 +59,7 @@ class Actor:
     trained: ProbabilisticTensorDictSequential
     stored: tuple[NestedKey, ...] = ()
     sampled: str = "action"
+    drawn: tuple[NestedKey, ...] = ()
 
     @property
     def log_prob(self) -> str:

@@ -86,7 +86,7 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
         sampler("action", IndependentNormal, loc="loc", scale="scale"),
     )
     policy = ProbabilisticTensorDictSequential(*encoder, noise, *decoder)
-    return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,))
+    return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
 
 
 def latent_noise(loc: Tensor) -> Tensor:

@@ -5,15 +5,18 @@ from torchrl_mcp.objectives.latent import LatentPPOLoss
 from torchrl_mcp.objectives.option_critic import OptionAdvantages, OptionCriticLoss, OptionValueLoss
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 from torchrl_mcp.objectives.semi_markov import SemiMarkovAdvantages
+from torchrl_mcp.objectives.symmetry import MirroredSamples, SymmetryLoss
 from torchrl_mcp.objectives.values import ValueLoss
 
 __all__ = [
     "Advantages",
     "BoundedClipPPOLoss",
     "LatentPPOLoss",
+    "MirroredSamples",
     "OptionAdvantages",
     "OptionCriticLoss",
     "OptionValueLoss",
     "SemiMarkovAdvantages",
+    "SymmetryLoss",
     "ValueLoss",
 ]

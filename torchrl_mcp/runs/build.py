@@ -173,6 +173,13 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
     optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
     loss = instantiate(cfg.objective.loss)(agent.actor.trained, None)
     loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
+    advantages = instantiate(cfg.objective.advantages)(agent.critic)
+    if symmetry := instantiate(cfg.get("symmetry")):
+        mirrors = nn.ModuleDict(source.env.mirrors()).to(cfg.device)
+        if "advantages" in symmetry:
+            advantages = symmetry["advantages"](advantages, agent.actor, mirrors)
+        if "loss" in symmetry:
+            loss = symmetry["loss"](loss, agent.actor, mirrors)
     training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
     training["frames_per_batch"] *= cfg.get("batch_factor", 1)
     return Trainer(
@@ -181,7 +188,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         actor=agent.actor,
         critic=agent.critic,
         losses={"actor": loss, "critic": instantiate(cfg.objective.value_loss)(agent.critic)},
-        advantages=instantiate(cfg.objective.advantages)(agent.critic),
+        advantages=advantages,
         optimizers=optimizers,
         frozen=agent.frozen,
         metrics_writer=MetricsWriter(folder),

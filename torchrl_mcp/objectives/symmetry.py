@@ -1,0 +1,100 @@
+"""Mirror images in learning: a character that is symmetric may walk its walks with left and right exchanged."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.methods.options import OptionActor
+
+
+class MirroredSamples:
+    """Advantages of samples of which half, drawn anew in every batch, are replaced by their mirror images.
+
+    The mirror image of a sample has the mirrored state, goal and action, and the same advantage. Its log-probability is
+    that of the policy of now, so that the first ratio of PPO is one. Samples are as many as before, and cost as much.
+
+    Args:
+        advantages: Estimates advantages of trajectories ``(N, T)``.
+        actor: The actor.
+        mirrors: Reflections of ``observation``, ``goal`` and ``action``.
+
+    Raises:
+        ValueError: If the actor explores over something that has no mirror image.
+
+    Reference:
+        Abdolhosseini et al., *On Learning Symmetric Locomotion*, 2019, which adds the images to the samples (DUP).
+        https://doi.org/10.1145/3359566.3360070
+    """
+
+    def __init__(self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module]) -> None:
+        _require_actions(actor)
+        self.advantages, self.actor, self.mirrors = advantages, actor, mirrors
+        self.out_keys = advantages.out_keys
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the samples of trajectories ``(N, T)``, half of them mirrored, with the estimates of advantages."""
+        samples = self.advantages(batch)
+        chosen = torch.rand(samples.shape, device=samples.device) < 0.5
+        image = samples[chosen]
+        for key, mirror in self.mirrors.items():
+            image[key] = mirror(image[key])
+        acted = self.actor.policy(image.select("observation", "goal"))
+        for key in self.actor.stored:
+            if key not in self.actor.drawn:
+                image[key] = acted[key]
+        image[self.actor.log_prob] = self.actor.trained.get_dist(image).log_prob(image["action"])
+        samples[chosen] = image
+        return samples
+
+
+class SymmetryLoss(nn.Module):
+    r"""An actor's loss plus a penalty on mean actions that are not the mirror images of those in mirrored states.
+
+    .. math:: L + c \, \mathbb{E} \left\| \mu(s, g) - M_a \, \mu(M_s s, M_g g) \right\|^2
+
+    Args:
+        loss: The actor's loss.
+        actor: The actor.
+        mirrors: Reflections of ``observation``, ``goal`` and ``action``.
+        coeff: Weight of the penalty, :math:`c`.
+
+    Raises:
+        ValueError: If the actor explores over something that has no mirror image.
+
+    Reference:
+        Yu, Turk and Liu, *Learning Symmetric and Low-Energy Locomotion*, 2018, Eq. 4. https://arxiv.org/abs/1801.08093
+    """
+
+    def __init__(self, loss: nn.Module, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:
+        super().__init__()
+        _require_actions(actor)
+        self.loss, self.actor, self.mirrors, self.coeff = loss, actor, mirrors, coeff
+        # What is drawn, such as the noise of a latent variable, is the same on both sides: only `trained` reads it.
+        self._network: Any = actor.trained if actor.drawn else actor.policy
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add ``loss_symmetry`` to the terms of the actor's loss."""
+        report: TensorDictBase = self.loss(tensordict)
+        image = tensordict.select("observation", "goal", *self.actor.drawn)
+        mean = self._mean(image.copy())
+        for key in ("observation", "goal"):
+            image[key] = self.mirrors[key](image[key])
+        difference = mean - self.mirrors["action"](self._mean(image))
+        return report.set("loss_symmetry", self.coeff * difference.square().sum(-1).mean())
+
+    def _mean(self, samples: TensorDictBase) -> Tensor:
+        mean: Tensor = self._network.get_dist(samples).mean
+        return mean
+
+
+def _require_actions(actor: Actor) -> None:
+    if isinstance(actor, OptionActor) or actor.sampled != "action":
+        raise ValueError(
+            "symmetry mirrors the actions of one policy: options and gate weights have no mirror images. Pass "
+            "symmetry=none, or exploration=action and a method without options"
+        )
