@@ -1,6 +1,7 @@
 """From a configuration to environments, an agent and its trainer: the library's door to Hydra."""
 
 import inspect
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -206,6 +207,8 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
 
 def make_loggers(cfg: DictConfig) -> list[Logger]:
     """Return the configured logger, if any."""
+    # MLflow 3 wants to be asked for files, which need no server and stay in the run folder.
+    os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
     return [instantiate(cfg.logger)] if cfg.logger else []
 
 
