@@ -101,7 +101,7 @@ class CharacterEnv(EnvBase):
         self.generator = torch.Generator()
         self.set_seed(seed)
         self._dtype, self._pin_memory = dtype, pin_memory
-        self._cameras: dict[tuple[int, int], Camera] = {}
+        self._camera: tuple[tuple[int, int], Camera] | None = None
 
     @classmethod
     def characters(cls) -> tuple[str, ...]:
@@ -160,15 +160,12 @@ class CharacterEnv(EnvBase):
         """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
         if not 0 <= index < self.num_envs:
             raise ValueError(f"index={index} names no simulation: pass one of 0..{self.num_envs - 1}")
-        if (width, height) not in self._cameras:
-            self._cameras[width, height] = Camera(self.simulation.model, width=width, height=height)
-        camera = self._cameras[width, height]
+        camera = self._camera_of(width, height)
         return camera.picture(self.simulation.data(index), self.arrows(index), distance=distance)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free what drawing holds."""
-        while self._cameras:
-            self._cameras.popitem()[1].close()
+        self._close_camera()
         super().close(raise_if_closed=raise_if_closed)
 
     def arrows(self, index: int) -> list[Arrow]:
@@ -181,6 +178,18 @@ class CharacterEnv(EnvBase):
             Arrows, each its tail and tip, ``(3,)`` in metres.
         """
         return []
+
+    def _camera_of(self, width: int, height: int) -> Camera:
+        """Return the camera for pictures of a size. There is one at a time: each holds tens of megabytes."""
+        if self._camera is None or self._camera[0] != (width, height):
+            self._close_camera()
+            self._camera = (width, height), Camera(self.simulation.model, width=width, height=height)
+        return self._camera[1]
+
+    def _close_camera(self) -> None:
+        if self._camera is not None:
+            self._camera[1].close()
+            self._camera = None
 
     def _make_specs(self) -> None:
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""

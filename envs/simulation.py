@@ -1,6 +1,7 @@
 """Many simulations of one MuJoCo model, as torch tensors."""
 
 import copy
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -60,6 +61,7 @@ class Simulation:
         self._after_reset = stages.mjSTAGE_VEL if current else stages.mjSTAGE_ACC
         self.physics_seconds = 0.0
         """Wall-clock seconds spent inside MuJoCo so far."""
+        self._process = os.getpid()
         self._batch = Batch(self.model, num_envs, num_threads, persistent)
         self._data = mujoco.MjData(self.model)
         fields = {name: self._batch.bind(name) for name in (*CHANGING_FIELDS, *GIVEN_FIELDS)}
@@ -141,6 +143,11 @@ class Simulation:
 
     def _run(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> np.ndarray:
         """Call MuJoCo, count the time, and return the simulations in which it raised an error."""
+        if os.getpid() != self._process:  # MuJoCo would wait for ever for threads that a fork does not copy
+            raise RuntimeError(
+                f"process {os.getpid()} inherited this environment by a fork from process {self._process}, without its "
+                "threads: make environments in the process that steps them"
+            )
         start = time.perf_counter()
         try:
             call(*args, **kwargs)

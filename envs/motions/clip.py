@@ -1,18 +1,34 @@
 """Motion clips: what a character's joints do over time."""
 
-from collections.abc import Sequence
+import lzma
+import math
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tokenize import TokenError
 from typing import Self
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.joints import JointLayout, joint_layout
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
+
+LARGEST = 2**28
+"""Bytes of the arrays of a clip: hours of a T-Rex at 60 frames per second."""
+
+# What zipfile, NumPy and torch raise when a file is damaged or of another kind.
+UNREADABLE = (
+    *(ArithmeticError, AttributeError, BadZipFile, EOFError, LookupError, MemoryError, OSError, RuntimeError),
+    *(SyntaxError, TokenError, TypeError, ValueError, lzma.LZMAError, struct.error, zlib.error),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +47,7 @@ class MotionClip:
         loop: Whether the motion repeats.
 
     Raises:
-        ValueError: If the states are not of that shape, not finite or not rotations, or ``fps`` is not positive.
+        ValueError: If the states are not of that shape, not finite or not rotations, or ``fps`` is no positive number.
 
     Example:
         >>> import torch
@@ -52,8 +68,8 @@ class MotionClip:
         layout = self.layout
         if self.qpos.ndim != 2 or self.qpos.shape[1] != layout.nq or len(self.qpos) < 2:
             raise ValueError(f"qpos has shape {tuple(self.qpos.shape)}: pass (T, {layout.nq}) with T >= 2")
-        if not self.fps > 0:
-            raise ValueError(f"fps={self.fps} is no frame rate: pass a positive number")
+        if not 0 < self.fps < math.inf:
+            raise ValueError(f"fps={self.fps} is no frame rate: pass a positive, finite number")
         qpos = self.qpos.detach().to("cpu", torch.float64, copy=True)
         if not qpos.isfinite().all():
             frame = int((~qpos.isfinite()).any(-1).nonzero()[0])
@@ -148,18 +164,23 @@ class MotionClip:
         """Read what :meth:`save` wrote.
 
         Raises:
-            ValueError: If the file is no clip, or its joints are not those of the character's model.
+            MotionFormatError: If the file is no clip, is damaged, or its joints are not those of the character's model.
         """
-        with np.load(path, allow_pickle=False) as archive:
-            if missing := {"character", "joints", "qpos", "fps", "loop"} - set(archive):
-                raise ValueError(f"path={str(path)!r} is no motion clip, it lacks {sorted(missing)}: pass a saved clip")
-            arrays = dict(archive)
+        try:
+            return cls._from_arrays(_arrays(Path(path)))
+        except UNREADABLE as error:
+            raise MotionFormatError(
+                path,
+                f"is no motion clip: {error}. Pass one that torchrl-mcp-motions import has written, or write it anew",
+            ) from error
+
+    @classmethod
+    def _from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self:
+        if missing := {"character", "joints", "qpos", "fps", "loop"} - set(arrays):
+            raise ValueError(f"it lacks {sorted(missing)}")
         character, joints = str(arrays["character"]), tuple(map(str, arrays["joints"]))
         if joints != (expected := joint_layout(character).names):
-            raise ValueError(
-                f"path={str(path)!r} has the joints {joints}, and {character}'s model has {expected}: "
-                "make the clip anew for this model"
-            )
+            raise ValueError(f"it has the joints {joints}, and {character}'s model has {expected}")
         return cls(character, torch.from_numpy(arrays["qpos"]), float(arrays["fps"]), loop=bool(arrays["loop"]))
 
     def _locate(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -173,6 +194,15 @@ class MotionClip:
     def _within(self, times: Tensor) -> Tensor:
         """State at times within the first cycle, the end included."""
         return replace(self, loop=False).at(times)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a NumPy archive, none of which would fill the memory."""
+    with ZipFile(path) as archive:
+        if (size := sum(member.file_size for member in archive.infolist())) > LARGEST:
+            raise ValueError(f"it would unpack to {size} bytes, more than the {LARGEST} of hours of motion")
+    with np.load(path, allow_pickle=False) as archive:
+        return dict(archive)
 
 
 def concatenated(clips: Sequence[MotionClip]) -> MotionClip:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchrl_mcp.envs import Holdout
+from torchrl_mcp.envs.rendering import Camera
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +82,13 @@ for _ in range(2):
     result = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("MuJoCo found no OpenGL") == 2
+
+
+def test_pictures_of_many_sizes_hold_one_opengl_context_at_a_time(env, monkeypatch):
+    closed, close = [], Camera.close
+    monkeypatch.setattr(Camera, "close", lambda camera: closed.append(close(camera)))
+    for others, width in enumerate((40, 48, 40), start=1):
+        assert env.render(width=width, height=24).shape == (24, width, 3)
+        assert len(closed) == others
+    env.render(width=40, height=24)
+    assert len(closed) == 3

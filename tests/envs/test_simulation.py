@@ -1,3 +1,6 @@
+import os
+import signal
+
 import mujoco
 import pytest
 import torch
@@ -115,3 +118,15 @@ def test_the_time_spent_in_physics_is_counted(ants):
     before = ants.physics_seconds
     ants.step(torch.zeros(4, 8))
     assert 0 < ants.physics_seconds - before < 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
+def test_simulations_that_a_fork_inherits_say_so_instead_of_waiting_for_threads_that_are_not_there(ants):
+    if not (child := os.fork()):
+        signal.alarm(20)
+        try:
+            ants.step(torch.zeros(len(ants.state["qpos"]), 8))
+        except RuntimeError as error:
+            os._exit(0 if "inherited this environment by a fork" in str(error) else 2)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -94,3 +94,20 @@ def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
 def test_impossible_arguments_are_refused_by_name(arguments, name):
     with pytest.raises(ValueError, match=name):
         RunningNormaliser(**arguments)
+
+
+@pytest.mark.parametrize("outlier", [1e9, -1e9, float("nan"), float("inf")])
+def test_a_sample_out_of_all_bounds_leaves_the_statistics_alone_and_is_told(outlier):
+    torch.manual_seed(0)
+    x = torch.randn(100, 3)
+    expected, normaliser = RunningNormaliser(3), RunningNormaliser(3)
+    expected.update(x)
+    spoilt = torch.cat([x, x[:1]])
+    spoilt[-1, 1] = outlier
+    with pytest.warns(UserWarning, match="1 of 101 samples have features beyond 100000"):
+        normaliser.update(spoilt)
+    for name, buffer in normaliser.named_buffers():
+        assert torch.equal(buffer, getattr(expected, name)), name
+    with pytest.warns(UserWarning, match="1 of 1 samples"):
+        normaliser.update(spoilt[-1:])
+    assert normaliser.count == 100

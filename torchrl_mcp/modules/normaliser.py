@@ -1,9 +1,13 @@
 """Running normalisation of network inputs."""
 
 import math
+import warnings
 
 import torch
 from torch import Tensor, nn
+
+LARGEST = 1e5
+"""Of the features of a sample: no simulation that has not diverged shows more, in SI units."""
 
 
 class RunningNormaliser(nn.Module):
@@ -53,7 +57,9 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Merge the samples ``x``, shape ``(*B, F)``, into the statistics.
+        """Merge the samples ``x``, shape ``(*B, F)``, into the statistics, with a warning but for those out of bounds.
+
+        A sample with a feature that is not finite or beyond ``LARGEST`` would leave nothing of what came before it.
 
         Reference:
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
@@ -61,6 +67,11 @@ class RunningNormaliser(nn.Module):
         if self.count >= self.max_count:
             return
         x = x.reshape(-1, x.shape[-1])
+        if not (within := (x.abs() <= LARGEST).all(-1)).all():
+            warnings.warn(f"{int((~within).sum())} of {len(x)} samples have features beyond {LARGEST:g}", stacklevel=2)
+            x = x[within]
+        if not len(x):
+            return
         variance, mean = torch.var_mean(x, dim=0, correction=0)
         share = (x.shape[0] / (self.count + x.shape[0])).to(mean.dtype)
         delta = mean - self.mean

@@ -1,5 +1,5 @@
-import io
 import math
+import zipfile
 
 import mujoco
 import numpy as np
@@ -8,6 +8,7 @@ import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip, concatenated, differences
+from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.joints import character_model, joint_layout, twin
 from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import about_z, heading
@@ -188,33 +189,30 @@ def test_a_file_gives_back_every_bit(character, tmp_path):
     assert (loaded.character, loaded.fps, loaded.loop) == (clip.character, clip.fps, clip.loop)
 
 
-def edited(clip, **changes):
+def edited(clip, folder, **changes):
     """The file of a clip with some of its arrays replaced, or left out where None."""
-    file = io.BytesIO()
+    file = folder / "clip.npz"
     clip.save(file)
-    file.seek(0)
     arrays = {**np.load(file), **changes}
-    file = io.BytesIO()
     np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
-    file.seek(0)
     return file
 
 
-def test_a_file_with_other_joints_is_refused_by_name():
+def test_a_file_with_other_joints_is_refused_by_name(tmp_path):
     clip, _ = random_clip()
     swapped = np.array(clip.layout.names)[::-1]
-    with pytest.raises(ValueError, match=r"has the joints .'left_ankle'.*make the clip anew"):
-        MotionClip.load(edited(clip, joints=swapped))
+    with pytest.raises(ValueError, match=r"has the joints .'left_ankle'.*write it anew"):
+        MotionClip.load(edited(clip, tmp_path, joints=swapped))
 
 
-def test_a_file_without_a_part_is_refused():
+def test_a_file_without_a_part_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"lacks \['fps'\]"):
-        MotionClip.load(edited(random_clip()[0], fps=None))
+        MotionClip.load(edited(random_clip()[0], tmp_path, fps=None))
 
 
-def test_a_file_that_holds_pickled_objects_is_not_read():
+def test_a_file_that_holds_pickled_objects_is_not_read(tmp_path):
     with pytest.raises(ValueError, match="allow_pickle"):
-        MotionClip.load(edited(random_clip()[0], fps=np.array([print], dtype=object)))
+        MotionClip.load(edited(random_clip()[0], tmp_path, fps=np.array([print], dtype=object)))
 
 
 @pytest.mark.parametrize(
@@ -226,6 +224,7 @@ def test_a_file_that_holds_pickled_objects_is_not_read():
         ({"qpos": torch.full((2, 29), torch.nan)}, "qpos is not finite in frame 0"),
         ({"fps": 0.0}, "fps=0.0 is no frame rate"),
         ({"fps": math.nan}, "fps=nan is no frame rate"),
+        ({"fps": math.inf}, "fps=inf is no frame rate"),
         ({"character": "dog"}, "character='dog' does not exist: pass one of"),
     ],
 )
@@ -246,3 +245,38 @@ def test_the_layout_names_every_number_of_a_state_once(character):
     assert known.tolist() == list(range(model.nq))
     rates = torch.cat([torch.arange(3), layout.spins.flatten(), layout.rates]).sort().values
     assert rates.tolist() == list(range(model.nv))
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_however_a_file_is_damaged_it_is_refused_by_name_with_the_remedy_or_read_as_it_was(tmp_path, save):
+    clip, _ = random_clip()
+    whole = edited(clip, tmp_path)
+    save(whole, **np.load(whole))
+    data, generator, refused = whole.read_bytes(), np.random.default_rng(0), []
+    file = tmp_path / "damaged.npz"
+    for kind in range(300):
+        spoilt = bytearray(data)
+        if kind % 3 == 0:
+            del spoilt[generator.integers(len(data)) :]
+        for position in generator.integers(0, len(spoilt) or 1, size=kind % 4 + 1 if spoilt else 0):
+            spoilt[position] ^= 1 << generator.integers(8)
+        file.write_bytes(spoilt)
+        try:
+            read = MotionClip.load(file)
+        except MotionFormatError as error:
+            refused.append(str(error))
+        else:
+            torch.testing.assert_close(read.qpos, clip.qpos, rtol=0, atol=0)
+    assert len(refused) > 200
+    assert all(str(file) in message and "torchrl-mcp-motions import" in message for message in refused)
+
+
+def test_a_file_that_would_fill_the_memory_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    clip, _ = random_clip()
+    bomb = edited(clip, tmp_path)
+    with zipfile.ZipFile(bomb, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("more.npy", "w") as member:
+        for _ in range(300):
+            member.write(bytes(2**20))
+    monkeypatch.setattr(np, "load", lambda *arguments, **settings: pytest.fail("it was unpacked"))
+    with pytest.raises(MotionFormatError, match="would unpack to"):
+        MotionClip.load(bomb)
