@@ -3,8 +3,8 @@ import socket
 import threading
 import time
 from types import SimpleNamespace
-from urllib.error import URLError
-from urllib.request import urlopen
+from urllib.error import HTTPError, URLError
+from urllib.request import Request, urlopen
 
 import mujoco
 import numpy as np
@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModule
 pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as MuJoCo 3.17 has it")
 
 from torchrl_mcp.envs import Heading
+from torchrl_mcp.viewer.guard import refusal
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.web import Pace, Stage, play_in_browser
 
@@ -110,3 +111,39 @@ def test_the_pace_is_what_the_controls_say():
     assert (pace.paused, pace.speed) == (False, 1.0)
     pace.on_step_control(messages.StepControlSnapshot(sim.PauseState.NORMAL_PAUSED, 50.0, 0.0, 0.0))
     assert (pace.paused, pace.speed) == (True, 0.5)
+
+
+def test_the_page_is_for_this_machine_and_its_own_address_alone(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    player = Brief()
+    with shown(player) as address:
+        fetched(f"{address}/")
+        port = int(address.rpartition(":")[2])
+        for headers in ({"Origin": "http://elsewhere.example"}, {"Host": "elsewhere.example"}):
+            with pytest.raises(HTTPError, match="403"):
+                urlopen(Request(f"{address}/model", headers=headers), timeout=5)
+        assert urlopen(Request(f"{address}/", headers={"Origin": address}), timeout=5).status == 200
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as visitor, pytest.raises(OSError, match="refused"):
+            visitor.connect(("127.0.0.2", port))  # what listens on every interface answers here as well
+
+
+@pytest.mark.parametrize(
+    ("path", "host", "origin", "address", "refused"),
+    [
+        ("/", "localhost:8080", None, "127.0.0.1", None),
+        ("/ui?sid=1", "localhost:8080", "http://localhost:8080", "127.0.0.1", None),
+        ("/drop", "127.0.0.1:8080", "http://127.0.0.1:8080", "::ffff:127.0.0.1", None),
+        ("/state", "192.0.2.7:8080", "http://192.0.2.7:8080", "192.0.2.9", None),
+        ("/ui", "192.0.2.7:8080", "http://192.0.2.7:8080", "192.0.2.9", "only the viewer's own machine"),
+        ("/drop?sid=1", "[2001:db8::7]:8080", "http://[2001:db8::7]:8080", "2001:db8::9", "own machine"),
+        ("/ui", "localhost:8080", "http://elsewhere.example", "127.0.0.1", "other sites"),
+        ("/ui", "localhost:8080", "http://localhost:9090", "127.0.0.1", "other sites"),
+        ("/ui", "localhost:8080", "null", "127.0.0.1", "other sites"),
+        ("/model", "elsewhere.example:8080", "http://elsewhere.example:8080", "127.0.0.1", "not the viewer's"),
+        ("/model", "", None, "127.0.0.1", "not the viewer's"),
+    ],
+)
+def test_who_may_what(path, host, origin, address, refused):
+    headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
+    reason = refusal(path, headers, address)
+    assert reason is None if refused is None else refused in reason

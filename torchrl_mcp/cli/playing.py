@@ -53,7 +53,7 @@ def show(
                 from torchrl_mcp.viewer.web import play_in_browser  # slow to load, as is the window
             except ImportError as error:
                 raise RuntimeError(f"Studio is not where mujoco 3.17 has it, install that: {error}") from error
-            play_in_browser(Player(policy, env, **look), port=arguments.port)
+            play_in_browser(Player(policy, env, **look), port=arguments.port, host=arguments.host)
         case "window":
             from torchrl_mcp.viewer.window import play_in_window
 

@@ -11,6 +11,7 @@ from torchrl_mcp.analysis.figures import colours
 from torchrl_mcp.envs.rendering import Shape
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
+from torchrl_mcp.viewer.guard import HERE, guarded
 from torchrl_mcp.viewer.player import Player, Weights
 
 FURTHER = 1.4
@@ -91,18 +92,19 @@ def as_geom(shape: Shape) -> mujoco.MjvGeom:
     return geom
 
 
-def play_in_browser(player: Player, *, port: int) -> None:
+def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
     """Play until the viewer is closed, in real time or as its controls say.
 
     Args:
         player: What to show.
         port: Of the page, 0 for the first free one from 8080.
+        host: Address of the interface to listen on; others than this machine can watch, but not control.
     """
     stage, pace = Stage(distance=FURTHER * DISTANCE * player.extent), Pace()
     model = softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
-    with launch_web.launch(config, plugins=[stage, pace]) as viewer:
+    with guarded(host), launch_web.launch(config, plugins=[stage, pace]) as viewer:
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / pace.speed
             if not pace.paused:

@@ -1,0 +1,86 @@
+"""Who reaches the web server of MuJoCo Studio: this machine alone, unless told otherwise, and no page of another site.
+
+Studio listens on every interface, gives whoever comes first control of the simulation, loads the models that they
+upload, and has no setting for any of it (MuJoCo 3.17). Here its server is told where to listen, and asks first.
+"""
+
+import socket
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from ipaddress import IPv6Address, ip_address
+from typing import Any
+from urllib.parse import urlsplit
+
+from mujoco.experimental.studio import web_viewer
+from mujoco.experimental.studio.web import web_server
+
+HERE = "127.0.0.1"
+"""This machine alone."""
+
+CONTROL = ("/ui", "/drop")
+"""Where the server takes input, and files to load."""
+
+VISITORS = (
+    "Everybody who can reach the port sees the simulation, its model and the viewer's log with paths of files. "
+    "Control and uploads stay with this machine"
+)
+
+
+@contextmanager
+def guarded(host: str) -> Iterator[None]:
+    """Let viewers that are opened in the block listen at ``host`` alone, and refuse what :func:`refusal` does."""
+    bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
+    web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    web_server.serve = partial(_serve, serve)
+    web_viewer._print_url_banner = lambda _, port: print(_greeting(host, port), flush=True)
+    try:
+        yield
+    finally:
+        web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner = bind, serve, banner
+
+
+def refusal(path: str, headers: Mapping[str, str], address: str) -> str | None:
+    """Return why a request is refused, or None if it is not.
+
+    Args:
+        path: What it asks for.
+        headers: Its ``Host``, and its ``Origin`` if a browser sends one.
+        address: Of the machine that it comes from.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if not _is_ours(urlsplit(f"//{host}").hostname or ""):  # a name that a stranger lets point here
+        return "this address is not the viewer's: use an IP address, or localhost"
+    if origin is not None and urlsplit(origin).netloc != host:
+        return "pages of other sites may not use the viewer"
+    if urlsplit(path).path in CONTROL and not _is_here(address):
+        return "only the viewer's own machine may control it or load models: use ssh -L"
+    return None
+
+
+def _serve(serve: Callable[..., Awaitable[Any]], *handler: Any, process_request: Callable, **settings: Any) -> Any:
+    def admit(connection: Any, request: Any) -> Any:
+        reason = refusal(request.path, request.headers, connection.remote_address[0])
+        return connection.respond(403, f"{reason}\n") if reason else process_request(connection, request)
+
+    return serve(*handler, process_request=admit, **settings)
+
+
+def _is_ours(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return name.lower() in {"localhost", socket.gethostname().lower(), socket.getfqdn().lower()}
+    return True
+
+
+def _is_here(address: str) -> bool:
+    found = ip_address(address.partition("%")[0])
+    mapped = found.ipv4_mapped if isinstance(found, IPv6Address) else None
+    return (mapped or found).is_loopback
+
+
+def _greeting(host: str, port: int) -> str:
+    if _is_here("127.0.0.1" if host == "localhost" else host):
+        return f"http://localhost:{port}/, for this machine alone. Ctrl+C ends it"
+    return f"http://{socket.gethostname() if host in ('0.0.0.0', '::') else host}:{port}/. {VISITORS}. Ctrl+C ends it"
