@@ -12,6 +12,7 @@ import pytest
 import torchrl_mcp
 from torchrl_mcp.cli import evaluate, figures, report, train
 from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs.trust import trusting
 
 TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorials" / "method.md"
 FILE = re.compile(r"^```\{code-block\} \w+\n:caption: (.*?)\n\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -61,7 +62,8 @@ def test_the_methods_are_not_the_librarys(folder):
 
 
 def test_of_the_weights_the_three_largest_stay(folder):
-    _, agent, env = experiment.restore(folder / "runs" / "top-new", num_envs=5, seed=0)
+    with trusting({"own_methods"}):
+        _, agent, env = experiment.restore(folder / "runs" / "top-new", num_envs=5, seed=0)
     gates = env.rollout(10, agent.actor.policy)["gates"]
     assert ((gates > 0).sum(-1) == 3).all()
     diagnostics = json.loads((folder / "evaluation.json").read_text())["deterministic"]["diagnostics"]
@@ -69,8 +71,9 @@ def test_of_the_weights_the_three_largest_stay(folder):
 
 
 def test_the_temperature_is_learned_at_transfer_while_the_primitives_stay(folder):
-    _, before, _ = experiment.restore(folder / "runs" / "tempered", num_envs=1, seed=0)
-    _, after, _ = experiment.restore(folder / "runs" / "tempered-new", num_envs=1, seed=0)
+    with trusting({"own_methods"}):
+        _, before, _ = experiment.restore(folder / "runs" / "tempered", num_envs=1, seed=0)
+        _, after, _ = experiment.restore(folder / "runs" / "tempered-new", num_envs=1, seed=0)
     assert before.parts["gating"].log_temperature.item() != after.parts["gating"].log_temperature.item() != 0.0
     kept = after.parts["primitives"].state_dict()
     assert all((value == kept[name]).all() for name, value in before.parts["primitives"].state_dict().items())
@@ -96,7 +99,13 @@ def test_the_report_has_both_methods_with_the_diagnostics_of_their_gates(folder)
 def test_without_the_folder_on_the_path_the_remedy_is_named(folder, monkeypatch):
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != folder])
     monkeypatch.delitem(sys.modules, "own_methods")
-    with pytest.raises(
-        ValueError, match=r"own_methods\S+, which Python does not find: .* add its folder to PYTHONPATH"
+    with (
+        pytest.raises(ValueError, match=r"own_methods\S+, which Python does not find: .* add its folder to PYTHONPATH"),
+        trusting({"own_methods"}),
     ):
+        experiment.restore(folder / "runs" / "top", num_envs=1, seed=0)
+
+
+def test_what_is_not_trusted_is_not_built_and_the_remedy_is_named(folder):
+    with pytest.raises(ValueError, match=r"would run own_methods\.\S+, .* pass --trust own_methods"):
         experiment.restore(folder / "runs" / "top", num_envs=1, seed=0)

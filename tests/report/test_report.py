@@ -1,3 +1,6 @@
+import json
+import math
+import random
 import re
 import sys
 from datetime import UTC, datetime
@@ -294,3 +297,43 @@ def test_the_command_tells_that_a_folder_holds_no_run(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(tmp_path)])
     with pytest.raises(SystemExit, match="holds no run: give folders"):
         main()
+
+
+JUNK = [None, True, -1, 1e400, math.nan, "", "many", "<b>", [], [[]], {}, {"a": {}}, "9" * 400]
+
+
+def spoil(content, generator):
+    """Replace, remove or add a value somewhere in a tree of objects."""
+    inside = [content] + [value for value in content.values() if isinstance(value, dict)]
+    target = generator.choice(inside)
+    key = generator.choice([*target, "surprise"]) if target else "surprise"
+    if generator.random() < 0.2:
+        target.pop(key, None)
+    else:
+        target[key] = generator.choice(JUNK)
+
+
+def test_however_the_files_of_runs_are_damaged_the_others_are_reported(write_run, tmp_path):
+    generator = random.Random(0)
+    write_run("whole", score=0.625, method="scratch")
+    for number in range(150):
+        folder = write_run(f"damaged{number}", score=0.5, seed=number + 1)
+        file = folder / ("evaluation.json", "origin.json")[number % 2]
+        content = json.loads(file.read_text())
+        for _ in range(1 + number % 3):
+            spoil(content, generator)
+        file.write_text(json.dumps(content))
+    runs, damaged = find_runs([tmp_path])
+    assert len(runs) + len(damaged) == 151
+    pages = report(runs, damaged, moment=datetime.now(UTC))
+    faulty = [run for run in runs if run.state == "damaged"]
+    assert 30 < len(faulty) < 150
+    assert all(str(run.path) in pages["report.md"] for run in faulty)
+    assert [run.state for run in runs if run.path.name == "whole"] == ["complete"]
+
+
+def test_what_the_environment_holds_does_not_get_into_a_report(write_run, tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "swordfish")
+    write_run("received", score=0.5, method__title="${oc.env:SECRET}")
+    pages = report(*find_runs([tmp_path]), moment=datetime.now(UTC))
+    assert "swordfish" not in "".join(pages.values())

@@ -66,6 +66,13 @@ def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
         ("evaluation.json", '{"episodes": 1', "evaluation.json cannot be read: Expecting"),
         ("evaluation.json", '{"deterministic": {}}', "evaluation.json cannot be read: it lacks 'normalised_return'"),
         ("evaluation.json", "[]", "evaluation.json cannot be read"),
+        ("evaluation.json", "[" * 100_000, "evaluation.json cannot be read: it is nested too deeply"),
+        (
+            "metrics.csv",
+            "iteration,frames,seconds\n1,1e300,1\n",
+            "metrics.csv cannot be read: its frames are no numbers",
+        ),
+        ("origin.json", '{"commit": [1]}', "origin.json cannot be read: its commit is"),
         ("origin.json", "", "origin.json cannot be read: Expecting value"),
         ("origin.json", '{"choices": []}', "origin.json cannot be read"),
     ],
@@ -88,10 +95,11 @@ def test_a_return_that_is_no_number_is_a_damage(write_run):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("method: [", "config.yaml cannot be read: while parsing"),
+        ("method: [", "config.yaml cannot be read: .*while parsing"),
         ("method: {name: mcp}", "config.yaml has no valid task.name, character.name, stage.name, seed, training"),
-        ("- 1", "config.yaml has no valid task.name"),
-        ("seed: ${nowhere}", "config.yaml cannot be read: .*nowhere"),
+        ("- 1", "config.yaml cannot be read: .*holds no settings"),
+        ("seed: ${nowhere}", "config.yaml has no valid task.name.* seed"),
+        ("a: &a [1]\nb: *a", "config.yaml cannot be read: .*refers to parts of itself"),
     ],
 )
 def test_a_configuration_that_cannot_be_read_is_named_with_the_reason(write_run, content, reason):

@@ -119,11 +119,11 @@ def flip_a_byte(data):
 
 
 @pytest.mark.parametrize("damage", [flip_a_byte, lambda data: data[:1000], lambda data: b"something else"])
-def test_a_damaged_checkpoint_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path, damage):
+def test_damage_of_all_checkpoints_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path, damage):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
-    newest = max((copy / "checkpoints").iterdir())
-    newest.write_bytes(damage(newest.read_bytes()))
+    for file in (copy / "checkpoints").iterdir():
+        file.write_bytes(damage(file.read_bytes()))
     cfg = OmegaConf.load(copy / "config.yaml")
     cfg.training.total_frames *= 2  # there is something left to do
     OmegaConf.save(cfg, copy / "config.yaml")

@@ -3,8 +3,10 @@
 import ast
 import os
 import runpy
+import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +16,13 @@ from torchrl_mcp.runs import lock
 
 ROOT = Path(__file__).parents[2]
 POSIX_ONLY = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"}
-HOLDER = "import sys; from torchrl_mcp.runs import lock; f = open(sys.argv[1]); lock.hold(f); print(); input()"
+HOLDER = """
+import pathlib, sys
+from torchrl_mcp.runs import lock
+with lock.held(pathlib.Path(sys.argv[1])):
+    print(flush=True)
+    input()
+"""
 
 
 @pytest.fixture
@@ -33,26 +41,70 @@ def windows(monkeypatch):
     return SimpleNamespace(**runpy.run_path(lock.__file__))
 
 
-def test_a_lock_is_held_until_its_process_dies(tmp_path):
-    file = tmp_path / "log"
-    file.touch()
-    assert not lock.is_held(file)
-    holder = subprocess.Popen([sys.executable, "-c", HOLDER, file], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    holder.stdout.readline()
-    assert lock.is_held(file)
-    holder.kill()
-    holder.wait()
-    assert not lock.is_held(file)
+@pytest.fixture
+def other(tmp_path):
+    """A process that holds the lock of ``tmp_path / "run"``."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, tmp_path / "run"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    process.stdout.readline()
+    yield process
+    process.kill()
+    process.wait()
 
 
-def test_on_windows_a_lock_is_held_by_the_one_who_took_it_and_leaves_the_text_readable(windows, tmp_path):
-    file = tmp_path / "log"
-    file.write_text("begun\n")
-    with file.open("a") as held:
-        windows.hold(held)
-        assert windows.is_held(file)
-        held.write("done\n")
-    assert file.read_text() == "begun\ndone\n"
+def test_a_lock_is_held_by_one_who_is_named_until_that_process_dies(other, tmp_path):
+    run = tmp_path / "run"
+    assert lock.holder(run) == f"process {other.pid} on {socket.gethostname()}"
+    with pytest.raises(ValueError, match=f"process {other.pid} on .* is at work"), lock.held(run):
+        pass
+    other.kill()
+    other.wait()
+    assert lock.holder(run) is None
+    with lock.held(run):
+        assert lock.holder(run) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert lock.holder(run) is None
+
+
+def test_a_lock_can_be_waited_for(other, tmp_path):
+    threading.Timer(1.0, other.kill).start()
+    with lock.held(tmp_path / "run", wait=True):
+        assert other.wait() != 0
+
+
+def test_folders_that_stay_empty_do_not_stay(tmp_path):
+    (tmp_path / "old").mkdir()
+    with lock.held(tmp_path / "old" / "new" / "run"):
+        pass
+    assert list((tmp_path / "old").iterdir()) == []
+    with lock.held(tmp_path / "run"):
+        (tmp_path / "run" / "config.yaml").touch()
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.yaml"]
+
+
+def test_who_looks_does_not_keep_the_one_who_comes_out(tmp_path):
+    ended = threading.Event()
+
+    def look():
+        while not ended.is_set():
+            lock.holder(tmp_path / "run")
+
+    watchers = [threading.Thread(target=look) for _ in range(3)]
+    for watcher in watchers:
+        watcher.start()
+    try:
+        for _ in range(50):
+            with lock.held(tmp_path / "run"):
+                pass
+    finally:
+        ended.set()
+
+
+def test_on_windows_a_lock_is_held_by_the_one_who_took_it_and_who_that_is_can_be_read(windows, tmp_path):
+    with windows.held(tmp_path):
+        assert (tmp_path / windows.LOCK).read_text().startswith("process ")
+        assert windows.holder(tmp_path).startswith("process ")
+    assert windows.holder(tmp_path) is None
 
 
 def test_nothing_but_the_lock_imports_what_only_posix_has():

@@ -34,8 +34,7 @@ def runs(tmp_path):
     alive = make_run(tmp_path / "alive", frames=400)
     planned = {tmp_path / name: 1000 for name in ("finished", "killed", "alive", "later")}
     write_manifest(planned, tmp_path / "multirun" / "benchmark-x.json")
-    with (alive / "train.log").open() as log:
-        lock.hold(log)
+    with lock.held(alive):
         yield tmp_path
 
 
@@ -98,3 +97,38 @@ def test_a_folder_that_is_not_there_is_named(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", "nowhere"])
     with pytest.raises(SystemExit, match="no folder nowhere"):
         main()
+
+
+def test_a_damaged_run_is_a_line_that_says_so_and_the_others_are_shown(runs, tmp_path):
+    damages = {
+        "config.yaml": ["", "training: [", "training: {total_frames: many}", "a: &a [1]\nb: *a", "[" * 5000],
+        "metrics.csv": ["iteration,frames\n1,many\n", "iteration,frames\n1,inf\n"],
+        "evaluation.json": ["", "[]", "[" * 100_000, '{"deterministic": {"normalised_return": "high"}}'],
+    }
+    for file, contents in damages.items():
+        for number, content in enumerate(contents):
+            run = make_run(tmp_path / "bad" / f"{file}-{number}", frames=400)
+            (run / file).write_text(content)
+    (tmp_path / "multirun" / "benchmark-damaged.json").write_text('{"run": "many"}')
+    found = {one.folder.name: one.state for one in look(runs)}
+    assert [found.pop(f"{file}-{number}") for file in damages for number in range(len(damages[file]))] == [
+        "damaged"
+    ] * 11
+    assert found.pop("benchmark-damaged.json") == "damaged"
+    assert found == {"finished": "done", "killed": "stopped", "alive": "running", "later": "waiting"}
+    assert "12 damaged" in shown(runs)
+
+
+def test_brackets_in_the_name_of_a_folder_are_shown(runs, tmp_path):
+    for name in ("freeze-[]", "freeze-[primitives]", "[", "[x]"):
+        make_run(tmp_path / name, frames=400)
+    make_run(tmp_path / "[" / "x]", frames=400)
+    text = shown(runs)
+    for name in ("freeze-[]", "freeze-[primitives]", "[x]", "[/x]"):
+        assert f"{name} " in text
+
+
+def shown(runs):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table(look(runs), runs))
+    return console.file.getvalue()

@@ -2,8 +2,10 @@ import hashlib
 import io
 import json
 import logging
+import os
 import pickle
 import random
+import shutil
 import tempfile
 import zipfile
 from pathlib import Path
@@ -15,7 +17,16 @@ from torch import nn
 from torchrl import torchrl_logger
 
 from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.training.checkpoint import find, load, load_parts, rotation, run_checkpoint, saved_config
+from torchrl_mcp.training.checkpoint import (
+    find,
+    find_all,
+    load,
+    load_parts,
+    rotation,
+    run_checkpoint,
+    save,
+    saved_config,
+)
 
 CONFIG = {"method": {"name": "mcp"}, "seed": 3}
 PREFIX = "components/0000-part-gating"
@@ -123,6 +134,41 @@ def test_the_newest_checkpoints_stay_and_the_newest_is_found(tmp_path):
     parts = make()
     load_parts(parts, list(parts), find(tmp_path))
     assert same(components(parts), components(make(9000)))
+
+
+def test_a_copy_of_a_checkpoint_beside_the_run_s_own_is_not_taken_for_the_newest(run):
+    newest = find(run)
+    for name in ("checkpoint-best.torchrl", "checkpoint-.torchrl", "checkpoint-000000009999.torchrl.damaged"):
+        shutil.copy(newest, newest.with_name(name))
+    assert find(run) == newest
+
+
+def test_a_checkpoint_is_on_the_disk_before_the_one_before_goes(tmp_path, monkeypatch):
+    checkpoints, flushed, flush = rotation(tmp_path, keep_last=1), [], os.fsync
+
+    def fsync(descriptor):
+        flushed.append(sorted(path.name for path in find_all(tmp_path)))
+        flush(descriptor)
+
+    save(run_checkpoint(make()), checkpoints, step=100, config=CONFIG)
+    monkeypatch.setattr(os, "fsync", fsync)
+    save(run_checkpoint(make()), checkpoints, step=200, config=CONFIG)
+    first, second = "checkpoint-000000000100.torchrl", "checkpoint-000000000200.torchrl"
+    assert flushed == [[first], [first, second]]  # the file, and then the folder with its name
+    assert [path.name for path in find_all(tmp_path)] == [second]
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size_is_refused_before_it_is_unpacked(run, monkeypatch):
+    bomb = run / "bomb.torchrl"
+    with zipfile.ZipFile(find(run)) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name))
+        target.writestr("components/more.memmap", bytes(10_000_000))
+    monkeypatch.setattr(zipfile.ZipFile, "open", lambda *arguments, **settings: pytest.fail("it was unpacked"))
+    with pytest.raises(ValueError, match="would unpack to more than its own size"):
+        load_parts(make(), ["gating"], bomb)
+    with pytest.raises(ValueError, match="would unpack to more than its own size"):
+        saved_config(bomb)
 
 
 @pytest.mark.parametrize("place", [".", "absent", "temporary"])

@@ -2,6 +2,7 @@ import csv
 import math
 
 import pytest
+from torchrl.record.loggers import get_logger
 
 from torchrl_mcp.training.metrics import MetricsWriter
 
@@ -113,7 +114,43 @@ def test_a_header_that_a_kill_cut_short_is_written_anew(tmp_path):
 
 def test_rewinding_before_anything_was_written_does_nothing(tmp_path):
     writer = MetricsWriter(tmp_path)
-    writer.rewind(5)
+    writer.rewind(0)
     assert not (tmp_path / "metrics.csv").exists()
     writer.write({"iteration": 1}, step=1)
     assert table(tmp_path) == [{"iteration": "1"}]
+
+
+def test_rows_that_are_missing_before_a_checkpoint_are_named_and_the_file_stays(tmp_path):
+    fill(tmp_path, range(1, 8))
+    before = (tmp_path / "metrics.csv").read_bytes()
+    with pytest.raises(ValueError, match="ends after 7 iterations, the checkpoint is of iteration 10"):
+        MetricsWriter(tmp_path).rewind(10)
+    assert (tmp_path / "metrics.csv").read_bytes() == before
+    with pytest.raises(ValueError, match="ends after 0 iterations"):
+        MetricsWriter(tmp_path / "gone").rewind(10)
+
+
+def test_a_file_that_somebody_removes_is_missed_at_the_next_row_and_the_next_checkpoint(tmp_path):
+    writer = fill(tmp_path, [1])
+    (tmp_path / "metrics.csv").unlink()
+    with pytest.raises(FileNotFoundError, match=r"metrics\.csv"):
+        writer.write({"iteration": 2, "frames": 200, "loss": 0.1}, step=200)
+    with pytest.raises(FileNotFoundError, match=r"metrics\.csv"):
+        writer.flush()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_csv_logger_holds_every_step_once_after_a_rewind(tmp_path):
+    def writer():
+        logger = get_logger("csv", logger_name=str(tmp_path), experiment_name="csv")
+        return MetricsWriter(tmp_path, [logger])
+
+    first = writer()
+    for i in range(1, 6):
+        first.write({"iteration": i, "frames": 100 * i, "task/loss": i / 2}, step=100 * i)
+    second = writer()
+    second.rewind(3)
+    for i in (4, 5):
+        second.write({"iteration": i, "frames": 100 * i, "task/loss": i / 2}, step=100 * i)
+    lines = (tmp_path / "csv/scalars/task/loss.csv").read_text().split()
+    assert lines == ["100,0.5", "200,1.0", "300,1.5", "400,2.0", "500,2.5"]

@@ -1,9 +1,10 @@
 import json
 import os
+import tempfile
 
 import pytest
 
-from torchrl_mcp.training.run_folder import replacing, write_json
+from torchrl_mcp.training.run_folder import remove_leftovers, replacing, write_json
 
 
 def test_readers_find_the_old_content_until_the_new_is_whole(tmp_path):
@@ -48,3 +49,24 @@ def test_the_content_is_on_the_disk_before_it_gets_its_name_and_then_the_name_is
 def test_json_is_written_into_folders_that_are_made(tmp_path):
     write_json({"score": 0.5}, tmp_path / "a" / "b" / "evaluation.json")
     assert json.loads((tmp_path / "a" / "b" / "evaluation.json").read_text()) == {"score": 0.5}
+
+
+def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    run, temporary = tmp_path / "run", tmp_path / "temporary"
+    kept = [run / "config.yaml", run / "checkpoints/checkpoint-000000000128.torchrl", temporary / "other/file"]
+    kept.append(temporary / "torchrl-checkpoint-load-young/manifest.json")
+    left = [
+        run / "checkpoints/.checkpoint-000000000256.torchrl.partial.stage-1f/components/0/x.memmap",
+        run / "checkpoints/.checkpoint-000000000256.torchrl.partial.archive-2e",
+        run / "checkpoints/checkpoint-000000000256.torchrl.partial",
+        run / "evaluation.json.partial",
+        temporary / "torchrl-checkpoint-load-old/components/x.memmap",
+    ]
+    for path in (*kept, *left):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("content")
+    os.utime(temporary / "torchrl-checkpoint-load-old", (0, 0))
+    remove_leftovers(run)
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == set(kept)
+    assert not (temporary / "torchrl-checkpoint-load-old").exists()

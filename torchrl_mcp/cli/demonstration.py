@@ -143,8 +143,8 @@ def policies(folder: Path, runs: Runs) -> dict[str, Policy]:
 
 def learn_and_transfer(folder: Path, runs: Runs) -> None:
     """Pre-train MCP, transfer it, evaluate it before and after, and record where it goes."""
-    train(runs["pretrain"])
-    train(runs["transfer"])
+    experiment.train_or_resume(runs["pretrain"])
+    experiment.train_or_resume(runs["transfer"])
     for name in ("before", "after"):
         evaluate(folder, runs, name)
     for name in PANELS:
@@ -153,18 +153,9 @@ def learn_and_transfer(folder: Path, runs: Runs) -> None:
 
 def learn_from_scratch(folder: Path, runs: Runs) -> None:
     """Train scratch on the held-out directions, and evaluate it."""
-    train(runs["scratch"])
+    experiment.train_or_resume(runs["scratch"])
     for name in ("scratch_early", "scratch"):
         evaluate(folder, runs, name)
-
-
-def train(cfg: DictConfig) -> None:
-    """Train as configured, or go on where training stopped."""
-    folder = Path(cfg.run_dir)
-    if (folder / CONFIG).exists():
-        experiment.resume(folder)
-    else:
-        experiment.train(cfg)
 
 
 def evaluate(folder: Path, runs: Runs, name: str) -> None:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
 
@@ -24,9 +24,11 @@ def main() -> None:
         path = locate(arguments.checkpoint)
         announce(PROGRAM)
         from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+        from torchrl_mcp.runs.trust import trusting
 
-        clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
-        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
+        with trusting(arguments.trust):
+            clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
+            results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
     report(arguments, results, [asdict(clip) for clip in clips])
@@ -74,6 +76,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
     )
+    add_trust(parser)
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
     return parser
 

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
 PROGRAM = "torchrl-mcp-figures"
@@ -27,8 +27,10 @@ def main() -> None:
         arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
         announce(PROGRAM)
         from torchrl_mcp.cli import paper_figures
+        from torchrl_mcp.runs.trust import trusting
 
-        getattr(paper_figures, arguments.draw)(arguments)
+        with trusting(arguments.trust):
+            getattr(paper_figures, arguments.draw)(arguments)
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
 
@@ -41,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT")
     shared.add_argument("--output", type=Path, default=Path("figures"), help="folder (default figures)")
+    add_trust(shared)
     shared.add_argument("--seed", type=int, default=0, help="of environments and of what is random (default 0)")
 
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")

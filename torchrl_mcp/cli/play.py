@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, find_own_modules, new_parser
 from torchrl_mcp.runs.builtin import locate
 
 PROGRAM = "torchrl-mcp-play"
@@ -29,8 +29,10 @@ def main() -> None:
             find_own_modules()
         announce(PROGRAM)
         from torchrl_mcp.cli.playing import play
+        from torchrl_mcp.runs.trust import trusting
 
-        play(arguments)
+        with trusting(arguments.trust):
+            play(arguments)
     except (RuntimeError, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
@@ -59,6 +61,7 @@ def parser() -> argparse.ArgumentParser:
         help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER; with --agent "
         "settings of an environment instead, as torchrl-mcp-train takes them",
     )
+    add_trust(parser)
     parser.add_argument("--agent", choices=["zero", "random"], help="actions of zero, or random ones: nothing trained")
     parser.add_argument(
         "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: where settings of your own are"
@@ -84,9 +87,16 @@ def parser() -> argparse.ArgumentParser:
     viewer.add_argument(
         "--viewer",
         choices=["web", "window"],
-        help="show it live instead: in a browser (anyone who can reach the port can watch), or in a window",
+        help="show it live instead: in a browser on this machine, or in a window",
     )
     viewer.add_argument("--port", type=int, default=0, help="of the page (default: the first free one from 8080)")
+    viewer.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address that the page is served at (default 127.0.0.1, for this machine alone). With another, such as "
+        "0.0.0.0, everybody who can reach the port sees the simulation, its model and the viewer's log with paths of "
+        "files, without a password; control and uploads stay with this machine",
+    )
     return parser
 
 

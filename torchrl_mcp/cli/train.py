@@ -4,7 +4,7 @@ import argparse
 import sys
 from importlib.resources import files
 
-from torchrl_mcp.cli.parsing import find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_trust, find_own_modules, new_parser, take_trust
 
 PROGRAM = "torchrl-mcp-train"
 
@@ -35,18 +35,21 @@ examples:
 
 def main() -> None:
     """Run the command line, and where it names an unknown setting say which one was perhaps meant."""
-    words = sys.argv[1:]
+    trusted, words = take_trust(sys.argv[1:])
     if own := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(own))
     from torchrl_mcp.cli.suggestions import suggestions
     from torchrl_mcp.cli.training import run, run_benchmark
+    from torchrl_mcp.runs.trust import trusting
 
     if any(word.startswith(("-cd", "--config-dir")) for word in words):
         find_own_modules()
+    sys.argv[1:] = words
     arguments = [word for word in words if word not in ("-m", "--multirun")]
     is_benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
-        run_benchmark(arguments) if is_benchmark else run()
+        with trusting(trusted):
+            run_benchmark(arguments) if is_benchmark else run()
     except SystemExit as stop:
         if stop.code == 1:
             print(*suggestions(words), sep="\n", file=sys.stderr)
@@ -63,6 +66,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration, do nothing else")
     parser.add_argument("-sc", "--shell-completion", action="store_true", help="install with -sc install=bash")
+    add_trust(parser)
     parser.add_argument("--hydra-help", action="store_true", help="what else Hydra has")
     return parser
 

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from torchrl_mcp.cli.parsing import announce
 from torchrl_mcp.cli.summary import final_return, summary
+from torchrl_mcp.training.run_folder import CONFIG
 
 PROGRAM = "torchrl-mcp-train"
 
@@ -23,10 +24,24 @@ def run(cfg: DictConfig) -> float | None:
 
     try:
         folder = _resume(Path(cfg.resume)) if cfg.resume else experiment.train(cfg)
-    except ValueError as error:
+    except (ValueError, FloatingPointError) as error:
         sys.exit(f"{PROGRAM}: {error}")
+    except HydraException as error:
+        sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}")
+    except OSError as error:
+        sys.exit(f"{PROGRAM}: {error}. {_what_is_safe(cfg)}")
+    except KeyboardInterrupt:
+        sys.exit(f"\n{PROGRAM}: interrupted. {_what_is_safe(cfg)}")
     print(summary(folder), flush=True)
     return final_return(folder)
+
+
+def _what_is_safe(cfg: DictConfig) -> str:
+    """Return what a run that failed has left, and how to go on."""
+    folder = Path(cfg.resume or cfg.run_dir)
+    if not (folder / CONFIG).is_file():
+        return "No run has begun: mend the cause, and give the same command again"
+    return f"All up to the last checkpoint is safe in {folder}: go on with {PROGRAM} resume={folder}"
 
 
 def run_benchmark(arguments: list[str]) -> None:
@@ -46,7 +61,7 @@ def run_benchmark(arguments: list[str]) -> None:
     except HydraException as error:
         print(error, file=sys.stderr)
         sys.exit(1)
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted; call it again to go on from here")

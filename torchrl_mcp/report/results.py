@@ -1,7 +1,6 @@
 """The contents of run folders: configuration, progress, evaluation and provenance."""
 
 import csv
-import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,16 +11,20 @@ from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
 
 from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
 from torchrl_mcp.runs import build
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE
+from torchrl_mcp.runs.trust import read_config
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE, read_json
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
 
+SAID = {"choices": str, "machine": str | int}
+"""What the groups of a run's provenance hold."""
+
+MOST_FRAMES = 1e15
+"""More than anybody trains."""
 
 REQUIRED = {
     "task.name": str,
@@ -161,10 +164,10 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
 def read_run(folder: Path) -> Run | Damaged:
     """Read a run folder; what is damaged is told, not raised."""
     try:
-        settings = dict(_leaves(OmegaConf.to_container(OmegaConf.load(folder / CONFIG), resolve=True)))
+        settings = dict(_leaves(read_config(folder / CONFIG)))
     except FileNotFoundError:
         return Damaged(folder, f"has no {CONFIG}")
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
+    except (OSError, ValueError) as error:
         return Damaged(folder, f"{CONFIG} cannot be read: {_line(error)}")
     if unfit := [name for name, kind in REQUIRED.items() if not isinstance(settings.get(name), kind)]:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
@@ -177,7 +180,7 @@ def read_run(folder: Path) -> Run | Damaged:
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
         try:
             contents |= read(folder)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, csv.Error) as error:
             faults.append(f"{file} cannot be read: {_line(error)}")
     return Run(folder, **contents, fault="; ".join(faults) or None)
 
@@ -203,6 +206,8 @@ def _progress(folder: Path) -> dict[str, Any]:
     rows = read_metrics(folder)
     if not rows:
         return {}
+    if not all(0 <= row["frames"] < MOST_FRAMES for row in rows):
+        raise ValueError(f"its frames are no numbers of steps, below {MOST_FRAMES:.0e}")
     return {
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],
@@ -213,19 +218,38 @@ def _progress(folder: Path) -> dict[str, Any]:
 def _evaluation(folder: Path) -> dict[str, Any]:
     if not (folder / EVALUATION).exists():
         return {}
-    content = json.loads((folder / EVALUATION).read_text())
+    content = read_json(folder / EVALUATION)
+    for name, kind in {"episodes": int, "seed": int, "environment": dict}.items():
+        if not isinstance(content.get(name), kind | None):
+            raise ValueError(f"its {name} is {content[name]!r}")
     for mode in MODES:
-        for value in (content[mode]["normalised_return"], *content[mode]["interval"]):
+        numbers = content[mode]
+        for value in (numbers["normalised_return"], *numbers["interval"]):
             if not math.isfinite(value):
                 raise ValueError(f"the {mode} normalised return is {value}")
+        if wrong := [name for name, value in numbers.items() if not _is_evaluated(name, value)]:
+            raise ValueError(f"its {mode} {', '.join(wrong)} cannot be that")
     return {"evaluation": content}
+
+
+def _is_evaluated(name: str, value: Any) -> bool:
+    """Tell whether an evaluation may say this of a quantity."""
+    if name == "interval":
+        return isinstance(value, list) and len(value) == 2
+    if name in ("metrics", "diagnostics"):
+        return isinstance(value, dict) and all(isinstance(number, int | float) for number in value.values())
+    return isinstance(value, int | float)
 
 
 def _provenance(folder: Path) -> dict[str, Any]:
     if not (folder / PROVENANCE).exists():
         return {}
-    content = json.loads((folder / PROVENANCE).read_text())
-    content.get("choices", {}).get("preset")
+    content = read_json(folder / PROVENANCE)
+    for name, kind in {"choices": dict, "machine": dict, "commit": str, "precision": str}.items():
+        if not isinstance(content.get(name), kind | None):
+            raise ValueError(f"its {name} is {content[name]!r}")
+        if kind is dict and not all(isinstance(value, SAID[name]) for value in (content.get(name) or {}).values()):
+            raise ValueError(f"its {name} are {content[name]!r}")
     return {"provenance": content}
 
 

@@ -27,7 +27,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import build, experiment, lock
+from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.training.run_folder import CONFIG, LOG
@@ -162,6 +162,7 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     HydraConfig.instance().set_config(cfg)  # for what refers to it
     with read_write(cfg), open_dict(cfg):
         del cfg["hydra"]
+    build.require_valid(cfg)
     build.require_environment(cfg)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     HydraConfig.instance().cfg = former
@@ -212,18 +213,12 @@ def run(cfg: DictConfig) -> None:
     """Train as configured, or go on where training stopped, with all that is printed in the run folder's log."""
     folder = Path(cfg.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOG).open("a", buffering=1) as log:
-        # Where another process trains this run, wait for it. The lock also shows that the run is alive.
-        lock.hold(log)
-        with redirect_stdout(log), redirect_stderr(log):
-            try:
-                if (folder / CONFIG).exists():
-                    experiment.resume(folder)
-                else:
-                    experiment.train(cfg)
-            except Exception:
-                traceback.print_exc()
-                raise
+    with (folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            experiment.train_or_resume(cfg, wait=True)
+        except Exception:
+            traceback.print_exc()
+            raise
 
 
 def is_complete(folder: Path) -> bool:

@@ -3,7 +3,7 @@
 import inspect
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Compose
@@ -27,6 +28,8 @@ from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.runs import settings
+from torchrl_mcp.runs.trust import require_trusted, targets
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter
@@ -44,6 +47,19 @@ class Agent:
     frozen: FrozenParts
 
 
+def require_valid(cfg: DictConfig) -> None:
+    """Check the values of all settings.
+
+    Raises:
+        ValueError: As :func:`torchrl_mcp.runs.settings.require_valid`, or if one refers to another that is not there.
+    """
+    try:
+        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+    except OmegaConfBaseException as error:
+        raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
+    settings.require_valid(config)
+
+
 def require_environment(cfg: DictConfig) -> None:
     """Check that there is an environment for the configured task, stage and character.
 
@@ -59,8 +75,7 @@ def require_environment(cfg: DictConfig) -> None:
             f"task={task} with stage=transfer and pretrained=<folder of the pre-training>, or pretrained=builtin"
         )
     # The motions of a character of your own may be what introduces it, so all that is named is imported.
-    named = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
-    environment, *_ = [get_object(name) for name in named]
+    environment, *_ = [get_object(name) for name in named(cfg.task[cfg.stage.name])]
     able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
         known = " or ".join(able)
@@ -73,7 +88,11 @@ def require_equipment(cfg: DictConfig) -> None:
     Raises:
         ValueError: If it has not.
     """
-    if torch.device(cfg.device).type == "cuda" and not torch.cuda.is_available():
+    try:
+        kind_of_device = torch.device(cfg.device).type
+    except RuntimeError as error:
+        raise ValueError(f"device={cfg.device} is none that torch knows: pass cpu or cuda") from error
+    if kind_of_device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
             "build of torch on a machine with a GPU"
@@ -84,36 +103,33 @@ def require_equipment(cfg: DictConfig) -> None:
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
-    """Check that everything is there that the configuration of a run names.
+    """Check that everything that the configuration of a run names may be built, and is there.
 
     Args:
         config: The configuration.
         source: The file that holds it.
 
     Raises:
-        ValueError: If something is not.
+        ValueError: If something may not, or is not.
     """
-    for name in targets(config):
-        if _exists(name):
-            continue
-        if name.startswith("torchrl_mcp."):
-            raise ValueError(
-                f"{source} is of another version of torchrl-mcp: it names {name}, which this version does not have. "
-                "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
-            )
+    names = list(targets(config))
+    # Looking for what is the library's runs nothing else.
+    if lost := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
         raise ValueError(
-            f"{source} names {name}, which Python does not find: if the module is yours, add its folder to PYTHONPATH"
+            f"{source} is of another version of torchrl-mcp: it names {lost[0]}, which this version does not have. "
+            "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
+        )
+    require_trusted(config, source)
+    if lost := [name for name in names if not _exists(name)]:
+        raise ValueError(
+            f"{source} names {lost[0]}, which Python does not find: if the module is yours, add its folder to "
+            "PYTHONPATH"
         )
 
 
-def targets(config: Any) -> Iterator[str]:
-    """Yield the name of everything that a configuration makes, and of modules to import, from the top."""
-    if isinstance(config, Mapping):
-        yield from (name for key in ("_target_", "module") if isinstance(name := config.get(key), str))
-    elif not isinstance(config, list):
-        return
-    for item in config.values() if isinstance(config, Mapping) else config:
-        yield from targets(item)
+def named(cfg: DictConfig) -> list[str]:
+    """Return the names of all that a configuration makes."""
+    return list(targets(OmegaConf.to_container(cfg, resolve=True)))
 
 
 def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
@@ -123,8 +139,8 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
         ValueError: As :func:`require_environment`.
     """
     require_environment(cfg)
-    settings = {"num_threads": cfg.num_threads, **kwargs}
-    env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, **settings)
+    arguments = {"num_threads": cfg.num_threads, **kwargs}
+    env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, **arguments)
     if not (transforms := instantiate(cfg.get("transforms", []))):
         return env
     return TransformedCharacterEnv(env, Compose(*transforms))

@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,15 +16,17 @@ from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, lock
 from torchrl_mcp.runs.build import Agent, make_agent, make_env, make_source, make_trainer
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import provenance
 from torchrl_mcp.runs.publish import publish
+from torchrl_mcp.runs.trust import read_config, trusting
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.precision import choose, name
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, replacing, write_json
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, remove_leftovers, replacing, write_json
 from torchrl_mcp.training.trainer import Trainer
 
 
@@ -32,26 +36,14 @@ def train(cfg: DictConfig) -> Path:
     The folder's configuration holds the precision that was chosen, where ``cfg.autocast`` leaves it to the machine.
 
     Raises:
-        ValueError: If the folder holds a run already, there is no environment for the configured task and character, or
-            the configuration lacks the checkpoint to transfer from.
+        ValueError: If the folder holds a run already, another process is at work on it, there is no environment for the
+            configured task and character, or the configuration lacks the checkpoint to transfer from.
     """
-    folder = Path(cfg.run_dir)
-    if (folder / CONFIG).exists():
-        raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    build.require_valid(cfg)
     build.require_environment(cfg)
     build.require_equipment(cfg)
-    pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
-    print(f"{folder}: {precision}", flush=True)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
-    trainer = _trainer(cfg, folder, pretrained)
-    folder.mkdir(parents=True, exist_ok=True)
-    trainer.save()
-    write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)
-    # Last, because it is what says that there is a run to resume.
-    with replacing(folder / CONFIG) as partial:
-        OmegaConf.save(cfg, partial, resolve=True)
-    _finish(trainer, cfg, folder)
-    return folder
+    with _held(Path(cfg.run_dir)), trusting(build.named(cfg)):
+        return _train(cfg)
 
 
 def resume(folder: Path) -> Path:
@@ -60,21 +52,30 @@ def resume(folder: Path) -> Path:
     A run that :func:`is_complete` is left as it is. On another machine it keeps the precision that it began with.
 
     Raises:
-        ValueError: If the folder holds no run, or its checkpoint is damaged.
+        ValueError: If the folder holds no run, another process is at work on it, or its checkpoint is damaged.
     """
     if is_complete(folder):
         return folder
-    cfg, newest = run_config(folder), checkpoint.find(folder)
-    print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
-    if checkpoint.frames(newest):
-        trainer = _trainer(cfg, folder)
-        trainer.restore(newest)
-    else:  # the environments have not been reset yet, so there is no state of theirs to return to
-        trainer = _trainer(cfg, folder, _pretrained(cfg))
-        trainer.metrics_writer.rewind(0)
-    (folder / EVALUATION).unlink(missing_ok=True)
-    _finish(trainer, cfg, folder)
-    return folder
+    with _held(folder):
+        return _resume(folder)
+
+
+def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
+    """Train as configured, or go on where training stopped; return the folder.
+
+    Args:
+        cfg: The configuration. A run that has begun goes on with its own.
+        wait: If another process is at work on the run, wait for that.
+
+    Raises:
+        ValueError: As :func:`train` and :func:`resume`.
+    """
+    folder = Path(cfg.run_dir)
+    build.require_valid(cfg)
+    build.require_environment(cfg)
+    build.require_equipment(cfg)
+    with _held(folder, wait=wait), trusting(build.named(cfg)):
+        return _resume(folder) if (folder / CONFIG).exists() else _train(cfg)
 
 
 def run_config(folder: Path) -> DictConfig:
@@ -85,9 +86,9 @@ def run_config(folder: Path) -> DictConfig:
     """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
-    cfg = cast("DictConfig", OmegaConf.load(folder / CONFIG))
-    build.require_known(cast("dict[str, Any]", OmegaConf.to_container(cfg)), folder / CONFIG)
-    return cfg
+    config = read_config(folder / CONFIG)
+    build.require_known(config, folder / CONFIG)
+    return OmegaConf.create(config)
 
 
 def policy_config(path: Path) -> DictConfig:
@@ -222,6 +223,77 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
     return follow_each(agent.actor.policy, env)
 
 
+@contextmanager
+def _held(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold a run folder alone, without what killed processes left in it."""
+    with lock.held(folder, wait=wait):
+        remove_leftovers(folder)
+        yield
+
+
+def _train(cfg: DictConfig) -> Path:
+    folder = Path(cfg.run_dir)
+    if (folder / CONFIG).exists():
+        raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
+    print(f"{folder}: {precision}", flush=True)
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
+    trainer = _trainer(cfg, folder, pretrained)
+    trainer.save()
+    write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)
+    # Last, because it is what says that there is a run to resume.
+    with replacing(folder / CONFIG) as partial:
+        OmegaConf.save(cfg, partial, resolve=True)
+    _finish(trainer, cfg, folder)
+    return folder
+
+
+def _resume(folder: Path) -> Path:
+    if is_complete(folder):
+        return folder
+    cfg = run_config(folder)
+    print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
+    trainer = _restored(cfg, folder)
+    (folder / EVALUATION).unlink(missing_ok=True)
+    _finish(trainer, cfg, folder)
+    return folder
+
+
+def _restored(cfg: DictConfig, folder: Path) -> Trainer:
+    """Return the trainer of a run at its newest checkpoint that is not damaged; say so if that is not the newest."""
+    saved = checkpoint.find_all(folder) or [checkpoint.find(folder)]
+    path = next((path for path in saved if checkpoint.is_intact(path)), saved[0])
+    _require_same_run(cfg, path)
+    if checkpoint.frames(path):
+        trainer = _trainer(cfg, folder)
+        trainer.restore(path)
+    else:  # the environments have not been reset yet, so there is no state of theirs to return to
+        trainer = _trainer(cfg, folder, _pretrained(cfg))
+        trainer.metrics_writer.rewind(0)
+    for damaged in saved[: saved.index(path)]:
+        print(f"{damaged} is damaged: the run goes on from {path.name}, the newest that is intact", flush=True)
+        checkpoint.set_aside(damaged)
+    return trainer
+
+
+def _require_same_run(cfg: DictConfig, path: Path) -> None:
+    """Check that a checkpoint is of the run with the configuration ``cfg``, which may have become longer since.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    wanted = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+    held, wanted = (
+        {**config, "training": {**config["training"], "total_frames": None}}
+        for config in (checkpoint.saved_config(path), wanted)
+    )
+    if changed := differences(held, wanted, CONDUCT | PLACES | {"evaluation", "budget"}):
+        raise ValueError(
+            f"{path} is not of this run: it differs from {CONFIG} in {', '.join(changed)}. Put this run's own "
+            "checkpoint back, or remove the file to go on from the one before"
+        )
+
+
 def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> Trainer:
     if cfg.torch_threads:
         torch.set_num_threads(cfg.torch_threads)
@@ -249,6 +321,8 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     loggers = build.make_loggers(cfg)
     trainer.metrics_writer.loggers = [*loggers, *build.make_recorders(cfg, trainer.actor, folder, loggers)]
     trainer.run()
+    if not (folder / CONFIG).is_file():
+        raise FileNotFoundError(f"{folder} was removed while the run was at work: what it has learnt is lost")
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
         write_json(numbers, folder / EVALUATION)

@@ -4,7 +4,6 @@ Everything is read from the run folders, so it works beside a benchmark in any p
 """
 
 import csv
-import json
 import os
 import sys
 import threading
@@ -16,17 +15,22 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from omegaconf import OmegaConf
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, write_json
+from torchrl_mcp.runs.trust import read_config
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, read_json, write_json
 
 MANIFEST = "benchmark-{}.json"
-STYLES = {"running": "cyan", "stopped": "red", "done": "green", "waiting": "dim"}
+STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
+
+# What reading a damaged file raises.
+UNREADABLE = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, csv.Error)
+
 INTERVAL = 1.0
 """Seconds between looks at the folders."""
 
@@ -40,7 +44,7 @@ class Status:
 
     Attributes:
         folder: Its run folder.
-        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), or ``done``.
+        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), ``done``, or ``damaged`` (cannot be read).
         frames: Environment steps so far.
         total: Environment steps in all.
         speed: Environment steps per second, of the last iteration.
@@ -84,12 +88,23 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
 
 def look(folder: Path, runs: Runs | None = None) -> list[Status]:
     """Return how far ``runs`` are, or else all that lie in ``folder`` or that benchmarks there have planned."""
+    damaged: list[Status] = []
     if runs is None:
         found: dict[Path, int | None] = {path.parent.resolve(): None for path in sorted(folder.rglob(CONFIG))}
         for path in sorted(folder.rglob(MANIFEST.format("*"))):
-            found |= read_manifest(path)
+            try:
+                found |= read_manifest(path)
+            except UNREADABLE:
+                damaged.append(Status(path, "damaged", 0, 0))
         runs = found
-    return [status(run, total) for run, total in runs.items()]
+    return [_status(run, total) for run, total in runs.items()] + damaged
+
+
+def _status(run: Path, total: int | None) -> Status:
+    try:
+        return status(run, total)
+    except UNREADABLE:
+        return Status(run, "damaged", 0, total or 0)
 
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
@@ -100,7 +115,7 @@ def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
 
 def read_manifest(path: Path) -> dict[Path, int]:
     """Return which runs a benchmark has and how many steps each takes."""
-    return {(path.parent / run).resolve(): total for run, total in json.loads(path.read_text()).items()}
+    return {(path.parent / run).resolve(): int(total) for run, total in read_json(path).items()}
 
 
 def status(run: Path, total: int | None = None) -> Status:
@@ -110,13 +125,14 @@ def status(run: Path, total: int | None = None) -> Status:
     frames = int(last.get("frames", 0))
     speed, score = last.get("time/steps_per_second", 0.0), last.get("episode/normalised_return")
     if (run / EVALUATION).exists():
-        evaluation = json.loads((run / EVALUATION).read_text())
-        return Status(run, "done", frames, total, speed, evaluation["deterministic"]["normalised_return"])
-    if (run / LOG).exists() and lock.is_held(run / LOG):  # by the process that trains it
+        score = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
+        return Status(run, "done", frames, total, speed, score)
+    if lock.holder(run):
         return Status(run, "running", frames, total, speed, score)
     if frames >= total and not _plan(run)[1]:
         return Status(run, "done", frames, total, speed, score)
-    return Status(run, "stopped" if (run / LOG).exists() or frames else "waiting", frames, total, speed, score)
+    begun = (run / CONFIG).exists() or (run / LOG).exists()
+    return Status(run, "stopped" if begun else "waiting", frames, total, speed, score)
 
 
 def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -> Table:
@@ -131,7 +147,7 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
     for name in ("steps", "steps/s", "return", "left"):
         result.add_column(name, justify="right", no_wrap=True)
     for one in shown:
-        result.add_row(_name(one.folder, folder), *_cells(one), style=STYLES[one.state])
+        result.add_row(Text(_name(one.folder, folder)), *_cells(one), style=STYLES[one.state])
     return result
 
 
@@ -171,8 +187,8 @@ def _name(run: Path, folder: Path) -> str:
 @cache
 def _plan(run: Path) -> tuple[int, int]:
     """Return the environment steps of a run that has begun, and the episodes of the evaluation after them."""
-    cfg = OmegaConf.load(run / CONFIG)
-    return cfg.training.total_frames, OmegaConf.select(cfg, "evaluation.episodes", default=0)
+    config = read_config(run / CONFIG)
+    return int(config["training"]["total_frames"]), int(config.get("evaluation", {}).get("episodes", 0))
 
 
 def _last_row(path: Path) -> dict[str, float]:

@@ -17,7 +17,15 @@ from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-FOLDER = "checkpoints"
+from torchrl_mcp.training.run_folder import CHECKPOINTS, replacing
+
+FOLDER = CHECKPOINTS
+
+NAME = "checkpoint-{:012d}.torchrl"
+"""Of a checkpoint file, by environment steps, as TorchRL's rotation has it."""
+
+DAMAGED = ".damaged"
+"""At the end of the name of a checkpoint that could not be restored."""
 
 # What torchrl, tensordict, zipfile and json raise when a file is damaged or of another kind.
 UNREADABLE = (
@@ -83,6 +91,13 @@ def rotation(run: Path, keep_last: int) -> CheckpointRotation:
     return CheckpointRotation(run / FOLDER, keep_last=keep_last)
 
 
+def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
+    """Write ``checkpoint`` among ``checkpoints``. It is on the disk before older ones are removed."""
+    with replacing(checkpoints.directory / NAME.format(step)) as partial:
+        checkpoint.save(partial, metadata={"config": config})
+    checkpoints.prune()
+
+
 def find(path: Path) -> Path:
     """Return ``path`` if it is a file, or the newest checkpoint of the run folder ``path``.
 
@@ -91,15 +106,39 @@ def find(path: Path) -> Path:
     """
     if path.is_file():
         return path
-    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
-    if saved := sorted((path / FOLDER).glob("checkpoint-*.torchrl")):
-        return saved[-1]
+    if saved := find_all(path):
+        return saved[0]
     raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
 
 
+def find_all(run: Path) -> list[Path]:
+    """Return the checkpoint files of a run folder that training wrote, the newest first."""
+    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
+    return sorted((path for path in (run / FOLDER).glob("checkpoint-*.torchrl") if frames(path) >= 0), reverse=True)
+
+
+def is_intact(path: Path) -> bool:
+    """Tell whether the file ``path`` is a whole checkpoint, with a manifest and all checksums right."""
+    try:
+        _manifest(path)
+        with ZipFile(path) as archive:
+            return archive.testzip() is None
+    except UNREADABLE:
+        return False
+
+
+def set_aside(path: Path) -> None:
+    """Give a damaged checkpoint another name, by which nobody takes it for one of the run's."""
+    path.replace(path.with_name(f"{path.name}{DAMAGED}"))
+
+
 def frames(path: Path) -> int:
-    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written."""
-    return int(path.stem.rpartition("-")[2])
+    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written.
+
+    That of another file, such as a copy ``checkpoint-best.torchrl``, is -1.
+    """
+    step = path.stem.removeprefix("checkpoint-")
+    return int(step) if step.isdecimal() else -1
 
 
 def saved_config(path: Path) -> Mapping[str, Any]:
@@ -114,6 +153,7 @@ def saved_config(path: Path) -> Mapping[str, Any]:
 def _manifest(path: Path) -> Mapping[str, Any]:
     """Return what the checkpoint file ``path`` says of itself."""
     try:
+        _require_plain_data(path)
         manifest = Checkpoint.manifest(path)
         if "config" in manifest["metadata"]:
             return manifest
@@ -123,11 +163,16 @@ def _manifest(path: Path) -> Mapping[str, Any]:
 
 
 def _require_plain_data(path: Path) -> None:
-    """Refuse an archive with anything but JSON and tensors: tensordict would unpickle it, which can run any code."""
+    """Refuse an archive with anything but JSON and tensors, as large as they are.
+
+    Of other files tensordict would unpickle some, which can run any code, and what is compressed could fill a disk.
+    """
     with ZipFile(path) as archive:
         for name in archive.namelist():
             if not name.endswith((".json", ".memmap")):
                 raise CheckpointError(f"it holds {name}, which is neither JSON nor a tensor")
+        if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
+            raise CheckpointError("it would unpack to more than its own size, which no checkpoint of torchrl-mcp does")
 
 
 def _tells_of_another_version(record: LogRecord) -> bool:

@@ -6,7 +6,10 @@ from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
 
-from torchrl_mcp.training.run_folder import METRICS, replacing
+from torchrl_mcp.training.run_folder import METRICS, flush, replacing
+
+CSV_LOGGER = "csv/scalars"
+"""Where in a run folder TorchRL's csv logger has its files, of lines ``step,value``."""
 
 
 class MetricsWriter:
@@ -23,10 +26,16 @@ class MetricsWriter:
         self._columns: list[str] = []
 
     def write(self, metrics: Mapping[str, float], *, step: int) -> None:
-        """Append ``metrics``, which hold the same names every time, at environment step ``step``."""
+        """Append ``metrics``, which hold the same names every time, at environment step ``step``.
+
+        Raises:
+            FileNotFoundError: If somebody has removed the file since the last row.
+        """
         new = not self._columns
         if new:
             self._columns = list(metrics)
+        elif not self.path.exists():
+            raise FileNotFoundError(f"{self.path} is gone, and with it what the run has written")
         with self.path.open("a", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             if new:
@@ -35,13 +44,29 @@ class MetricsWriter:
         for logger in self.loggers:
             logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)
 
+    def flush(self) -> None:
+        """Make the system write what it holds back of the file to the disk.
+
+        Raises:
+            FileNotFoundError: If somebody has removed the file since the last row.
+        """
+        if self._columns:
+            flush(self.path)
+
     def rewind(self, iteration: int) -> None:
-        """Drop the rows after ``iteration``, which a run wrote that was killed before its next checkpoint."""
+        """Drop the rows after ``iteration``, which a run wrote that was killed before its next checkpoint.
+
+        Raises:
+            ValueError: If there are no rows up to there.
+        """
+        kept = [row for row in self._rows() if int(row["iteration"]) <= iteration]
+        if (last := int(kept[-1]["iteration"]) if kept else 0) < iteration:
+            raise ValueError(
+                f"{self.path} ends after {last} iterations, the checkpoint is of iteration {iteration}: put the file "
+                "back from a copy, or train in a new folder with stage=pretrain pretrained=<checkpoint file>"
+            )
         if not self.path.exists():
             return
-        with self.path.open(newline="") as file:
-            rows = csv.DictReader(file)
-            kept = [row for row in rows if None not in row.values() and int(row["iteration"]) <= iteration]
         # Without rows the header may be cut short as well: the next row writes it anew.
         self._columns = list(kept[0]) if kept else []
         with replacing(self.path) as partial, partial.open("w", newline="") as file:
@@ -49,3 +74,19 @@ class MetricsWriter:
             if kept:
                 writer.writeheader()
             writer.writerows(kept)
+        self._rewind_csv_logger(int(kept[-1]["frames"]) if kept else 0)
+
+    def _rewind_csv_logger(self, frames: int) -> None:
+        """Drop what TorchRL's csv logger, which appends to its files, has written after environment step ``frames``."""
+        for path in (self.path.parent / CSV_LOGGER).rglob("*.csv"):
+            steps = [line for line in path.read_text().splitlines() if line.partition(",")[0].isdecimal()]
+            with replacing(path) as partial:
+                partial.write_text("".join(f"{line}\n" for line in steps if int(line.partition(",")[0]) <= frames))
+
+    def _rows(self) -> list[dict[str, str]]:
+        """Return all whole rows that number their iteration."""
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="", errors="replace") as file:
+            rows = csv.DictReader(line.replace("\0", "") for line in file)
+            return [row for row in rows if None not in {*row, *row.values()} and row.get("iteration", "").isdecimal()]

@@ -2,6 +2,9 @@
 
 import json
 import os
+import shutil
+import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +25,21 @@ PROVENANCE = "origin.json"
 LOG = "train.log"
 """The output of a run of a benchmark."""
 
+CHECKPOINTS = "checkpoints"
+"""The folder of checkpoints."""
+
+PARTIAL = ".partial"
+"""At the end of the name of a file that is being written."""
+
+UNPACKED = "torchrl-checkpoint-load-*"
+"""Folders into which TorchRL unpacks checkpoints to read them, in the system's folder for temporary files."""
+
+LARGEST = 2**24
+"""Bytes of a JSON file that is read. One of a run has some thousand."""
+
+STALE = 3600.0
+"""Seconds after which nobody reads a checkpoint any more."""
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -31,12 +49,12 @@ def replacing(path: Path) -> Iterator[Path]:
     and folder are flushed to the disk. If the block fails, the old file stays. Missing folders are made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
+    partial = path.with_name(f"{path.name}{PARTIAL}")
     try:
         yield partial
-        _flush(partial)
+        flush(partial)
         partial.replace(path)
-        _flush(path.parent)
+        flush(path.parent)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -47,7 +65,48 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
         partial.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def _flush(path: Path) -> None:
+def read_json(path: Path) -> dict[str, Any]:
+    """Return what a JSON file holds.
+
+    Raises:
+        ValueError: If it is damaged, too large or nested too deeply, or holds no object.
+        OSError: If it cannot be read.
+    """
+    if path.stat().st_size > LARGEST:
+        raise ValueError(f"it has more than {LARGEST} bytes")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(content, dict):
+        raise ValueError("it holds no object")
+    return content
+
+
+def remove_leftovers(run: Path) -> None:
+    """Remove what processes that were killed left of files that they wrote, and of checkpoints that they read.
+
+    Nobody else may be at work on the run.
+    """
+    # TorchRL hides what it has not finished.
+    unfinished = [*(run / CHECKPOINTS).glob(".*"), *run.rglob(f"*{PARTIAL}")]
+    stale = [path for path in Path(tempfile.gettempdir()).glob(UNPACKED) if _age(path) > STALE]
+    for path in unfinished + stale:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _age(path: Path) -> float:
+    """Return the seconds since a file was changed, 0 if it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
+def flush(path: Path) -> None:
     """Make the system write a file, or the entries of a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

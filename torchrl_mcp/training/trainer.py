@@ -20,7 +20,7 @@ from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.bar import TrainingBar
-from torchrl_mcp.training.checkpoint import load, run_checkpoint
+from torchrl_mcp.training.checkpoint import load, run_checkpoint, save
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.episodes import EpisodeStatistics
@@ -148,7 +148,8 @@ class Trainer:
         """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
 
         Raises:
-            ValueError: If the file is damaged or belongs to another configuration; nothing has been written then.
+            ValueError: If the file is damaged or belongs to another configuration, or ``metrics.csv`` does not reach as
+                far; nothing has been written then.
         """
         load(self.checkpoint, path)
         if not self.source.resumes_episodes:
@@ -157,7 +158,8 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint."""
-        self.checkpoints.save(self.checkpoint, step=self.progress.frames, metadata={"config": self.config})
+        self.metrics_writer.flush()  # a checkpoint without the rows before it would be of no use
+        save(self.checkpoint, self.checkpoints, step=self.progress.frames, config=self.config)
 
     def _loop(self) -> None:
         with TrainingBar(self.total_frames, self.progress.frames, shown=self.progress_bar) as bar:

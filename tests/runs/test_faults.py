@@ -1,0 +1,168 @@
+"""What happens to a run when something goes wrong: another process, a full disk, a damaged file."""
+
+import csv
+import hashlib
+import json
+import os
+import shutil
+import zipfile
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from torchrl_mcp.runs import experiment, lock
+from torchrl_mcp.runs.status import status
+from torchrl_mcp.training import checkpoint
+
+SETTINGS = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "training.total_frames=640"]
+EVERY = ["checkpoint_interval=1", "keep_checkpoints=9"]
+
+
+def configure(folder, *overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", overrides=[*SETTINGS, *EVERY, f"run_dir={folder}", *overrides])
+
+
+def contents(folder):
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+
+
+def rows(folder):
+    with (folder / "metrics.csv").open(newline="") as file:
+        return [
+            {k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in csv.DictReader(file)
+        ]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of five iterations with all its checkpoints."""
+    return experiment.train(configure(tmp_path_factory.mktemp("runs") / "whole"))
+
+
+@pytest.fixture
+def killed(whole, tmp_path):
+    """The run as it was when it was killed after four iterations."""
+    folder = tmp_path / "killed"
+    shutil.copytree(whole, folder)
+    checkpoint.find(folder).unlink()
+    return folder
+
+
+def damage(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(data)
+
+
+def test_a_run_that_is_at_work_is_shown_as_running_and_nobody_joins_in(killed, tmp_path):
+    before = contents(killed)
+    with lock.held(killed):
+        assert status(killed).state == "running"
+        for join_in in (lambda: experiment.resume(killed), lambda: experiment.train(configure(killed))):
+            with pytest.raises(ValueError, match=f"process {os.getpid()} on .* is at work on it"):
+                join_in()
+    assert status(killed).state != "running"
+    assert contents(killed) == before
+
+
+def test_a_run_holds_its_folder_from_before_the_first_file_to_after_the_last(tmp_path, monkeypatch):
+    def seen(function):
+        def wrapper(*arguments, **settings):
+            states.append(status(tmp_path / "run", 640).state)
+            return function(*arguments, **settings)
+
+        return wrapper
+
+    states = []
+    monkeypatch.setattr(experiment, "_trainer", seen(experiment._trainer))
+    monkeypatch.setattr(experiment, "evaluation", seen(lambda *arguments, **settings: {"deterministic": {}}))
+    experiment.train(configure(tmp_path / "run", "evaluation.episodes=1"))
+    assert states == ["running", "running"]
+    assert lock.holder(tmp_path / "run") is None
+
+
+def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_one_before(whole, killed, capsys):
+    newest = checkpoint.find(killed)
+    damage(newest)
+    experiment.resume(killed)
+    said = capsys.readouterr().out
+    assert f"{newest} is damaged: the run goes on from checkpoint-000000000384.torchrl" in said
+    assert newest.with_name(f"{newest.name}.damaged").exists()
+    assert rows(killed) == rows(whole)
+    expected, parts = (experiment.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (whole, killed))
+    for name, value in expected.items():
+        assert torch.equal(parts[name], value), name
+
+
+def test_where_every_checkpoint_is_damaged_nothing_is_touched(killed):
+    for path in checkpoint.find_all(killed):
+        damage(path)
+    before = contents(killed)
+    with pytest.raises(ValueError, match="damaged"):
+        experiment.resume(killed)
+    assert contents(killed) == before
+
+
+def test_a_checkpoint_of_another_seed_is_refused(killed):
+    cfg = OmegaConf.load(killed / "config.yaml")
+    cfg.seed = 7
+    OmegaConf.save(cfg, killed / "config.yaml")
+    before = contents(killed)
+    with pytest.raises(ValueError, match=r"is not of this run: it differs from config.yaml in seed\. Put .* back"):
+        experiment.resume(killed)
+    assert contents(killed) == before
+
+
+def test_metrics_that_are_gone_are_named_with_the_remedy(killed):
+    (killed / "metrics.csv").unlink()
+    before = contents(killed)
+    with pytest.raises(ValueError, match=r"metrics\.csv ends after 0 iterations.*put the file back from a copy"):
+        experiment.resume(killed)
+    assert contents(killed) == before
+
+
+def test_a_disk_that_fills_up_while_the_configuration_is_written_leaves_no_run(tmp_path, monkeypatch):
+    def fill_up(cfg, path, resolve):
+        path.write_text("seed: 0\ntrain")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OmegaConf, "save", fill_up)
+        with pytest.raises(OSError, match="No space left"):
+            experiment.train(configure(tmp_path / "run"))
+    assert not (tmp_path / "run" / "config.yaml").exists()
+    experiment.train(configure(tmp_path / "run"))
+    assert len(rows(tmp_path / "run")) == 5
+
+
+def test_what_a_killed_save_left_is_gone_after_a_resume(killed):
+    left = killed / "checkpoints" / ".checkpoint-000000000640.torchrl.partial.stage-1f" / "components"
+    left.mkdir(parents=True)
+    experiment.resume(killed)
+    assert not left.parent.exists()
+
+
+def test_code_that_a_run_folder_or_a_checkpoint_names_is_not_run(killed, tmp_path):
+    evil = {"_target_": "torch.utils.collect_env.run", "command": f"touch {tmp_path / 'executed'}"}
+    cfg = OmegaConf.load(killed / "config.yaml")
+    cfg.parts = evil
+    OmegaConf.save(cfg, killed / "config.yaml")
+    newest = checkpoint.find(killed)
+    with zipfile.ZipFile(newest) as source:
+        members = {name: source.read(name) for name in source.namelist()}
+    manifest = json.loads(members["manifest.json"])
+    manifest["metadata"]["config"]["parts"] = evil
+    with zipfile.ZipFile(newest, "w") as target:
+        for name, content in (members | {"manifest.json": json.dumps(manifest)}).items():
+            target.writestr(name, content)
+    for use in (
+        lambda: experiment.resume(killed),
+        lambda: experiment.restore(killed, num_envs=1, seed=0),
+        lambda: experiment.evaluation(newest, episodes=1, seed=0),
+    ):
+        with pytest.raises(ValueError, match=r"would run torch.utils.collect_env.run, .* pass --trust"):
+            use()
+    assert not (tmp_path / "executed").exists()

@@ -1,0 +1,140 @@
+"""Values of settings: which are refused before anything is written, and how."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from torchrl_mcp import conf
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.settings import RULES
+
+METHODS = sorted(path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml"))
+PLACES = [(method, "heading") for method in METHODS] + [
+    ("mcp", task) for task in ("holdout", "imitation", "carry", "dribble")
+]
+
+
+@cache
+def composed(*overrides):
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", ["run_dir=never", *overrides])
+
+
+def place(method, task):
+    return f"method={method}", f"task={task}", f"stage={'pretrain' if task == 'imitation' else 'transfer'}"
+
+
+@pytest.mark.parametrize(("method", "task"), PLACES)
+def test_what_the_library_configures_is_valid(method, task):
+    build.require_valid(composed(*place(method, task)))
+
+
+@pytest.mark.parametrize("preset", ["paper", "smoke", "demo", "demo_smoke", "comparison"])
+def test_every_preset_is_valid(preset):
+    for method, task in (("mcp", "holdout"), ("hierarchical", "heading")):
+        build.require_valid(composed(*place(method, task), f"preset={preset}"))
+
+
+WRONG = {
+    "seed": ["null", "-1", "1.5", "many", str(2**32)],
+    "training.num_envs": ["0", "1.5", "null", "-4", "[1]"],
+    "training.frames_per_batch": ["0", "nan", "1e3"],
+    "training.minibatch_size": ["0", "null"],
+    "training.num_epochs": ["0", "-1", "true"],
+    "training.total_frames": ["-5", "nan", "inf", "0", "soon"],
+    "checkpoint_interval": ["0", "null"],
+    "keep_checkpoints": ["0"],
+    "num_threads": ["-1", "all"],
+    "torch_threads": ["0", "many"],
+    "progress_bar": ["1", "maybe"],
+    "autocast": ["perhaps", "2"],
+    "evaluation.episodes": ["-1", "1.5", "null"],
+    "evaluation.seed": ["-1", "null"],
+    "stage.gamma": ["2", "-0.1", "nan", "null"],
+    "objective.advantages.lmbda": ["1.5", "-1"],
+    "objective.advantages.clip": ["0", "-4"],
+    "objective.max_grad_norm": ["-1", "0", "nan"],
+    "objective.loss.clip_epsilon": ["-1", "0", "wide"],
+    "objective.loss.bound_coeff": ["-1"],
+    "optimizer.actor.lr": ["0", "-1e-3", "nan", "fast"],
+    "optimizer.actor.fused": ["2"],
+    "optimizer.schedule.target_kl": ["0", "-1"],
+    "critic.num_cells": ["[x]", "[0]", "5", "[1.5]"],
+    "num_primitives": ["0", "eight", "1.5", "null"],
+    "primitives.network.trunk_cells": ["[1024,0]", "null"],
+    "character.action_std": ["0", "-1"],
+    "transfer.freeze": ["primitives", "[1]"],
+    "task.evaluation.max_episode_steps": ["0", "1.5"],
+    "task.evaluation.directions": ["[2,1]", "[1]", "east"],
+    "task.evaluation.forward_weight": ["-1", "nan"],
+    "task.evaluation.terminate_when_unhealthy": ["2"],
+    "training": ["null", "5"],
+    "objective": ["null"],
+    "method": ["{}"],
+}
+
+
+@pytest.mark.parametrize(("setting", "value"), [(name, value) for name, values in WRONG.items() for value in values])
+def test_a_value_that_a_setting_cannot_have_is_named(setting, value):
+    cfg = composed().copy()
+    OmegaConf.set_struct(cfg, False)
+    OmegaConf.update(cfg, setting, OmegaConf.create(f"value: {value}").value, merge=False)
+    with pytest.raises(ValueError, match=setting.partition(".")[0]):
+        build.require_valid(cfg)
+
+
+def test_all_wrong_values_are_named_at_once_and_no_folder_is_made(tmp_path):
+    cfg = composed().copy()
+    cfg.run_dir, cfg.seed, cfg.training.num_epochs = str(tmp_path / "run"), None, 0
+    expected = (
+        r"seed=null must be a whole number from 0 to 4294967295\n"
+        r"training\.num_epochs=0 must be a whole number, at least 1"
+    )
+    with pytest.raises(ValueError, match=expected):
+        experiment.train(cfg)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_value_is_asked_for():
+    with pytest.raises(ValueError, match=r"motions\.path is needed: pass motions\.path="):
+        build.require_valid(composed("task=imitation", "motions=folder"))
+
+
+def test_no_setting_takes_a_run_out_of_the_folder_of_runs():
+    cfg = composed().copy()
+    cfg.run_dir = "runs/imitation-biped/pretrain/mcp/motions.path-../../../../../../elsewhere/seed0"
+    with pytest.raises(ValueError, match=r"leaves run_root=runs: pass a run_dir"):
+        build.require_valid(cfg)
+    cfg.run_dir = "../elsewhere"
+    build.require_valid(cfg)
+
+
+WITHOUT_RULE = {
+    *("_target_", "_partial_", "name", "title", "budget", "character", "path", "clips", "clip_end", "goal", "gating"),
+    *("primitives", "mixer", "trained", "dim", "interval", "explorer", "environment", "schedule", "mixture", "shaping"),
+    *("logger_name", "logger_type", "experiment_name", "backend", "address", "include_dashboard", "log_to_driver"),
+    *("num_cpus", "num_gpus", "memory", "distribution_class", "gate_activation", "transforms", "benchmark", "logger"),
+    "emphasis",
+}
+"""Names, what other groups make, and what TorchRL, Ray and the loggers check."""
+
+
+def test_every_number_of_the_library_s_settings_has_a_rule():
+    def leaves(tree, path=""):
+        for key, value in tree.items():
+            if isinstance(value, dict):
+                yield from leaves(value, f"{path}.{key}")
+            else:
+                yield f"{path}.{key}", value
+
+    free = set()
+    for method, task in PLACES:
+        for path, _ in leaves(OmegaConf.to_container(composed(*place(method, task)), resolve=True)):
+            if not any(path.endswith(f".{end}") for end in RULES):
+                free.add(path)
+    tables = (".method.paper.", ".fast.", ".method.standard.", ".goal.", ".hierarchy.", ".encoder.")
+    unruled = {path for path in free if path.rpartition(".")[2] not in WITHOUT_RULE and not path.startswith(tables)}
+    assert not unruled

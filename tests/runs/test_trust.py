@@ -1,0 +1,107 @@
+"""What configurations of files may name, and how they are read."""
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_mcp import conf
+from torchrl_mcp.runs.trust import GET_CLASS, KNOWN, read_config, require_trusted, targets, trusting
+
+FILE = Path("stranger/config.yaml")
+
+
+def makes(name, **arguments):
+    return {"seed": 0, "parts": [{"network": {"_target_": name, **arguments}}]}
+
+
+def test_what_may_be_built_is_what_the_files_of_the_library_name():
+    files = [OmegaConf.to_container(OmegaConf.load(path)) for path in Path(conf.__file__).parent.rglob("*.yaml")]
+    assert {name for file in files for name in targets(file)} == KNOWN
+    for file in files:
+        list(targets(file))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        makes("torch.utils.collect_env.run", command="touch here"),
+        makes("builtins.eval"),
+        makes("torchrl_mcp.runs.provenance.subprocess.run"),
+        makes("torchrl_mcp.training.run_folder.write_json"),
+        makes(GET_CLASS, path="subprocess.Popen"),
+        makes("torch.nn.Sigmoid.__init__.__globals__"),
+        makes("own.tasks.Juggle"),
+    ],
+)
+def test_nothing_else_may_be_built_and_the_remedy_is_named(config):
+    with pytest.raises(ValueError, match=r"stranger/config.yaml would run \S+, .* pass --trust \w+"):
+        require_trusted(config, FILE)
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A package of the user's own."""
+    (tmp_path / "own_package").mkdir()
+    (tmp_path / "own_package" / "__init__.py").write_text("import subprocess\nfrom .tasks import Juggle\n")
+    (tmp_path / "own_package" / "tasks.py").write_text("import os\nclass Juggle: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    for name in ("own_package", "own_package.tasks"):
+        sys.modules.pop(name, None)
+
+
+def test_what_a_trusted_module_defines_may_be_built_but_not_what_it_imports(own):
+    with trusting({"own_package"}):
+        for name in ("own_package.tasks.Juggle", "own_package.Juggle", "torch.nn.Sigmoid"):
+            require_trusted(makes(name), FILE)
+        for name in ("own_package.subprocess.run", "own_package.tasks.os.system", "own_package_2.Juggle"):
+            with pytest.raises(ValueError, match="would run"):
+                require_trusted(makes(name), FILE)
+    with trusting({"own_package.tasks.Juggle"}):
+        require_trusted(makes("own_package.tasks.Juggle"), FILE)
+    with pytest.raises(ValueError, match="would run"):
+        require_trusted(makes("own_package.tasks.Juggle"), FILE)
+
+
+def test_what_is_not_trusted_is_not_even_imported(tmp_path, monkeypatch):
+    (tmp_path / "trap.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"would run trap\.run"):
+        require_trusted(makes("trap.run"), FILE)
+
+
+def test_an_interpolation_is_neither_followed_nor_accepted(tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "swordfish")
+    file = tmp_path / "config.yaml"
+    file.write_text("task: {name: '${oc.env:SECRET}'}\n")
+    config = read_config(file)
+    assert config == {"task": {"name": "${oc.env:SECRET}"}}
+    with pytest.raises(ValueError, match="interpolation") as refusal:
+        require_trusted(config, file)
+    assert "swordfish" not in str(refusal.value)
+
+
+BOMB = "\n".join(["a0: &a0 [x]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)])
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (BOMB, "refers to parts of itself"),
+        ("[" * 5000, "is no configuration"),
+        ("a: " + "x" * 2**21, "bytes"),
+        ("a: [", "is no configuration"),
+        ("- 1", "holds no settings"),
+        ("a: 1\na: 2", "is no configuration"),
+    ],
+)
+def test_what_is_no_configuration_is_told_within_seconds(tmp_path, content, reason):
+    file = tmp_path / "config.yaml"
+    file.write_text(content)
+    began = time.process_time()
+    with pytest.raises(ValueError, match=reason):
+        read_config(file)
+    assert time.process_time() - began < 10

@@ -1,0 +1,196 @@
+"""The values that settings may have, checked once, before anything is written."""
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Rule(NamedTuple):
+    """What a setting may be.
+
+    Attributes:
+        words: What a message says of it.
+        allows: Whether a value is that.
+    """
+
+    words: str
+    allows: Callable[[Any], bool]
+
+    def or_null(self) -> "Rule":
+        """Return the rule that allows null as well."""
+        return Rule(f"{self.words}, or null", lambda value: value is None or self.allows(value))
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_number(value: Any) -> bool:
+    return _is_whole(value) or (isinstance(value, float) and math.isfinite(value))
+
+
+def _is_list(value: Any, allows: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(allows(item) for item in value)
+
+
+def _among(*choices: Any) -> Rule:
+    words = [str(choice).lower() for choice in choices]
+    return Rule(f"{', '.join(words[:-1])} or {words[-1]}", lambda value: any(value is x or value == x for x in choices))
+
+
+SEEDS = 2**32
+"""Number of seeds that all generators take."""
+
+COUNT = Rule("a whole number, at least 1", lambda value: _is_whole(value) and value >= 1)
+WHOLE = Rule("a whole number, at least 0", lambda value: _is_whole(value) and value >= 0)
+SEED = Rule(f"a whole number from 0 to {SEEDS - 1}", lambda value: _is_whole(value) and 0 <= value < SEEDS)
+POSITIVE = Rule("a finite number above 0", lambda value: _is_number(value) and value > 0)
+NOT_NEGATIVE = Rule("a finite number, at least 0", lambda value: _is_number(value) and value >= 0)
+SHARE = Rule("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1)
+PERIOD = Rule("a number above 0, or .inf", lambda value: value == math.inf or POSITIVE.allows(value))
+FLAG = Rule("true or false", lambda value: isinstance(value, bool))
+TEXT = Rule("a text", lambda value: isinstance(value, str) and bool(value))
+WIDTHS = Rule("a list of whole numbers, each at least 1", lambda value: _is_list(value, COUNT.allows))
+WEIGHTS = Rule("a list of finite numbers, each at least 0", lambda value: _is_list(value, NOT_NEGATIVE.allows))
+NAMES = Rule("a list of names", lambda value: _is_list(value, TEXT.allows))
+RANGE = Rule(
+    "two finite numbers in order, [low, high]",
+    lambda value: _is_list(value, _is_number) and len(value) == 2 and value[0] <= value[1],
+)
+
+RULES: dict[str, Rule] = {
+    **dict.fromkeys(
+        (
+            *("num_envs", "frames_per_batch", "minibatch_size", "num_epochs", "total_frames", "batch_factor"),
+            *("checkpoint_interval", "keep_checkpoints", "max_episode_steps", "num_workers", "switch_candidates"),
+            *("num_primitives", "num_options", "latent_dim", "steps_per_choice", "explorer.steps"),
+        ),
+        COUNT,
+    ),
+    **dict.fromkeys(("num_threads", "branch_cells", "warmup_batches", "evaluation.episodes"), WHOLE),
+    **dict.fromkeys(("torch_threads", "record_interval"), COUNT.or_null()),
+    "seed": SEED,
+    **dict.fromkeys(
+        (
+            *("lr", "min_lr", "max_lr", "target_kl", "clip_epsilon", "advantages.clip", "action_std", "initial_std"),
+            *("std", "logits_std", "scale", "reach", "max_error", "width"),
+        ),
+        POSITIVE,
+    ),
+    **dict.fromkeys(("max_grad_norm", "physics_timestep"), POSITIVE.or_null()),
+    "switch_interval": PERIOD,
+    **dict.fromkeys(
+        (
+            *("bound_coeff", "coeff", "kl_coeff", "termination_cost", "weight", "failure_weighting", "speed"),
+            *("max_turn", "slope", "target_distance_power", "reset_noise_scale"),
+            *("forward_weight", "healthy_weight", "control_weight", "contact_weight"),
+        ),
+        NOT_NEGATIVE,
+    ),
+    **dict.fromkeys(
+        (
+            *("gamma", "lmbda", "discount", "epsilon", "momentum", "terminations.initial"),
+            *("initial_states.rest", "initial_states.motions"),
+        ),
+        SHARE,
+    ),
+    **dict.fromkeys(
+        (
+            *(
+                "progress_bar",
+                "fused",
+                "entropy_bonus",
+                "functional",
+                "contact_forces",
+                "self_collision",
+                "learned_std",
+            ),
+            *(
+                "terminate_on_fall",
+                "terminate_when_unhealthy",
+                "success_reward",
+                "parts.blind",
+                "regret_per_step",
+                "staggered",
+            ),
+        ),
+        FLAG,
+    ),
+    **dict.fromkeys(
+        (
+            *("healthy_z_range", "initial_directions", "object_distances", "object_directions", "target_distances"),
+            *(
+                "target_directions",
+                "evaluation.directions",
+                *("environment.directions", "directions.pretrain", "directions.transfer"),
+                "pretrain.directions",
+                "transfer.directions",
+            ),
+        ),
+        RANGE,
+    ),
+    **dict.fromkeys(("num_cells", "state_cells", "goal_cells", "joint_cells", "trunk_cells", "values_cells"), WIDTHS),
+    **dict.fromkeys(("transfer.freeze", "transfer.keep"), NAMES),
+    **dict.fromkeys(("device", "run_dir", "run_root"), TEXT),
+    **dict.fromkeys(("pretrained", "resume"), TEXT.or_null()),
+    "autocast": _among(True, False, "auto"),
+    "switch_to": _among("any", "same"),
+    "friction_cone": _among("pyramidal", "elliptic"),
+    "emphasis.weights": WEIGHTS,
+    "practice.max_episode_steps": COUNT.or_null(),
+}
+"""By the end of a setting's path: what is called alike means the same wherever it stands."""
+
+GROUPS = ("task", "stage", "character", "method", "training", "evaluation", "optimizer", "objective", "transfer")
+"""Settings that hold others."""
+
+
+def require_valid(config: Mapping[str, Any]) -> None:
+    """Check the value of every setting that is of the library.
+
+    Args:
+        config: The resolved configuration of a run.
+
+    Raises:
+        ValueError: If some are wrong, with all of their names, values and what they may be.
+    """
+    lost = [name for name in GROUPS if not isinstance(config.get(name), Mapping)]
+    wrong = [f"{name}={_shown(config.get(name))} must be a group of settings" for name in lost]
+    for path, value in _settings(config):
+        if value == "???":
+            wrong.append(f"{path} is needed: pass {path}=...")
+        elif (rule := _rule(path)) and not rule.allows(value):
+            wrong.append(f"{path}={_shown(value)} must be {rule.words}")
+    if not wrong and _escapes(str(config["run_dir"]), str(config["run_root"])):
+        wrong.append(f"run_dir={config['run_dir']} leaves run_root={config['run_root']}: pass a run_dir")
+    if wrong:
+        raise ValueError("\n".join(wrong))
+
+
+def _rule(path: str) -> Rule | None:
+    parts = path.split(".")
+    return next((RULES[end] for start in range(len(parts)) if (end := ".".join(parts[start:])) in RULES), None)
+
+
+def _settings(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every setting that holds no others, with its path; a list of groups counts as groups."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _settings(inner, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        for item in value:
+            yield from _settings(item, path)
+    else:
+        yield path, value
+
+
+def _escapes(folder: str, root: str) -> bool:
+    """Tell whether a run folder that is written as below ``root`` is not."""
+    inside = Path(os.path.normpath(folder)).is_relative_to(os.path.normpath(root))
+    return folder.startswith(f"{root}/") and not inside
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,180 @@
+"""Configurations that come from files: what they may name, and how they are read.
+
+A configuration names the classes and functions to build. One of a checkpoint or run folder may be a stranger's, so it
+gets what the library's own files name, and nothing else that the user has not said to trust.
+"""
+
+import pkgutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+LARGEST = 2**20
+"""Bytes of a configuration file. One of a run has some ten thousand."""
+
+DEEPEST = 100
+"""Brackets in brackets of a configuration file. One of a run has five or so."""
+
+GET_CLASS = "hydra.utils.get_class"
+"""Hydra's function that returns a class, which configurations hand on to others."""
+
+KNOWN = frozenset(
+    {
+        GET_CLASS,
+        *("torch.nn.Sigmoid", "torch.nn.Softmax", "torch.optim.Adam", "torch.optim.SGD"),
+        *("torchrl.objectives.ClipPPOLoss", "torchrl.objectives.KLAdaptiveLR", "torchrl.record.loggers.get_logger"),
+    }
+    | {
+        f"torchrl_mcp.{module}.{name}"
+        for module, names in {
+            "distributions": ("AdditiveGaussian", "MultiplicativeGaussian"),
+            "envs": ("Carry", "Dribble", "Heading", "Holdout", "Imitation"),
+            "envs.motions": ("generated_library", "turning_clips"),
+            "envs.motions.corpus": ("folder_library",),
+            "envs.motions.single": ("single_motion",),
+            "methods.critic": ("value_critic",),
+            "methods.finetune": ("injected_actor", "injected_parts"),
+            "methods.hierarchical": (
+                *("gated_actor", "gated_parts", "primitive_actor", "primitive_parts", "random_sequence"),
+            ),
+            "methods.latent_space": ("latent_actor", "latent_parts", "random_latents"),
+            "methods.mcp": ("composite_actor", "composite_parts", "random_weights", "weights_actor"),
+            "methods.option_critic": (
+                *("option_critic_actor", "option_critic_parts", "option_values", "random_sequence"),
+            ),
+            "methods.options": ("SeparateOptions", "Terminations"),
+            "methods.scratch": ("gaussian_actor", "gaussian_parts"),
+            "methods.transforms": ("ClipAsOption", "OptionMemory"),
+            "modules": (
+                *("GaussianPolicy", "Gating", "GoalEncoder", "InjectedPolicy", "JointGating", "Primitives"),
+                "StateGoalEncoder",
+            ),
+            "objectives": (
+                *("Advantages", "BoundedClipPPOLoss", "LatentPPOLoss", "OptionAdvantages", "OptionCriticLoss"),
+                *("MirroredSamples", "SymmetryLoss"),
+                *("OptionValueLoss", "SemiMarkovAdvantages", "ValueLoss"),
+            ),
+            "training.collectors": ("RemoteSource", "local"),
+            "viewer.recorder": ("Recorder",),
+        }.items()
+        for name in names
+    }
+)
+"""What the files of ``conf`` name."""
+
+_trusted: ContextVar[frozenset[str]] = ContextVar("trusted", default=frozenset())
+
+
+@contextmanager
+def trusting(names: Collection[str]) -> Iterator[None]:
+    """Let configurations of files name more while the block runs.
+
+    Args:
+        names: Of modules, for all that they define, or of single classes and functions.
+    """
+    token = _trusted.set(_trusted.get() | set(names))
+    try:
+        yield
+    finally:
+        _trusted.reset(token)
+
+
+def targets(config: Any) -> Iterator[str]:
+    """Yield the name of everything that a configuration makes, hands on or imports, from the top."""
+    if isinstance(config, Mapping):
+        if isinstance(module := config.get("module"), str):
+            yield module
+        if isinstance(name := config.get("_target_"), str):
+            yield name
+            if name == GET_CLASS:
+                yield str(config.get("path"))
+    elif not isinstance(config, list):
+        return
+    for item in config.values() if isinstance(config, Mapping) else config:
+        yield from targets(item)
+
+
+def require_trusted(config: Mapping[str, Any], source: Path) -> None:
+    """Check, before anything is imported, that a configuration names nothing but what may be built.
+
+    Args:
+        config: The configuration.
+        source: The file that holds it.
+
+    Raises:
+        ValueError: If it does, or holds an interpolation, which could read the environment.
+    """
+    if name := next((name for name in targets(config) if not _may_be_built(name)), None):
+        raise ValueError(
+            f"{source} would run {name}, which no configuration of this library names. If you know the file and that "
+            f"code, pass --trust {name.rpartition('.')[0] or name}"
+        )
+    if any("${" in text for text in _texts(config)):
+        raise ValueError(f"{source} holds an interpolation, which training never writes: it was changed, do not use it")
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the configuration in a YAML file, with interpolations as they are written.
+
+    Raises:
+        ValueError: If it is no such file, is too large, refers to parts of itself or is nested too deeply.
+        OSError: If it cannot be read.
+    """
+    if path.stat().st_size > LARGEST:
+        raise ValueError(f"{path} has more than {LARGEST} bytes: that is no configuration")
+    text = path.read_text(encoding="utf-8")
+    if _depth(text) > DEEPEST:
+        raise ValueError(f"{path} is no configuration: brackets are nested more than {DEEPEST} deep")
+    try:
+        # Aliases of aliases make a few lines so large that no one ever reads them all.
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise ValueError(f"{path} refers to parts of itself (YAML aliases), which training never writes")
+        config: Any = OmegaConf.to_container(OmegaConf.create(text))
+    except (yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        first = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{path} is no configuration: {first}") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path} is no configuration: it holds no settings")
+    return config
+
+
+def _depth(text: str) -> int:
+    """Return how deep brackets are nested in a text."""
+    return max(accumulate((letter in "[{") - (letter in "]}") for letter in text), default=0)
+
+
+def _may_be_built(name: str) -> bool:
+    """Tell whether a configuration of a file may name this. Nothing is imported but modules that are trusted."""
+    trusted = _trusted.get()
+    if name in KNOWN | trusted:
+        return True
+    if not _is_in(name, trusted):
+        return False
+    try:
+        # A trusted module may have imported others, which are not meant.
+        return _is_in(f"{pkgutil.resolve_name(name).__module__}.", trusted)
+    except (ImportError, AttributeError, ValueError):
+        return True  # there is nothing to build
+
+
+def _is_in(name: str, modules: Collection[str]) -> bool:
+    return any(name.startswith(f"{module}.") for module in modules)
+
+
+def _texts(config: Any) -> Iterator[str]:
+    if isinstance(config, str):
+        yield config
+    elif isinstance(config, Mapping):
+        for key, value in config.items():
+            yield str(key)
+            yield from _texts(value)
+    elif isinstance(config, list):
+        for item in config:
+            yield from _texts(item)
