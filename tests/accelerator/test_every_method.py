@@ -16,9 +16,9 @@ METHODS = [
         for name in ("scratch", "finetune", "hierarchical", "option_critic", "moe", "latent_space")
     ),
 ]
-WAITS_PER_UPDATE = 4
-"""Means of the actor's gradient steps, of its last epoch's and of the critic's, and the policy's spread."""
-WAITS_OF_CRITIC = 2
+WAITS_PER_UPDATE = 5
+"""Means of the actor's gradient steps, of its last epoch's and of the critic's, the policy's spread, and dead units."""
+WAITS_OF_CRITIC = 3
 """The same where the critic alone learns."""
 WAITS_BESIDES = 25
 """What else an iteration records or selects by a mask, and what a run begins with."""
