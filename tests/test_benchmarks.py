@@ -55,6 +55,15 @@ def test_stable_baselines3_is_left_out_and_named_where_it_is_not_installed(monke
     assert capsys.readouterr().out == "sb3-dummy-4: skipped, for stable-baselines3 is not installed\n"
 
 
+def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):
+    output = tmp_path / "out.csv"
+    subprocess.run([sys.executable, BENCHMARKS / "ideal.py", "--quick", "--output", output], check=True, cwd=tmp_path)
+    with output.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["task"] for row in rows} == {"heading", "carry", "dribble", "holdout"}
+    assert all(0 < float(row["standing"]) < float(row["ideal"]) <= 1 for row in rows)
+
+
 def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
     rows = run("primitive_reuse.py", tmp_path / "out.csv")
     pairs = [(row["character"], row["precision"]) for row in rows]
