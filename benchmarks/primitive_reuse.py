@@ -79,7 +79,7 @@ def collect(trainer: Trainer, sizes: Sizes) -> TensorDictBase:
 def update(trainer: Trainer, batch: TensorDictBase) -> tuple[float, dict[str, float]]:
     """Return the milliseconds of an update and the means of what its loss reports."""
     start = time.perf_counter()
-    metrics = trainer._update(batch)
+    metrics = trainer._update(batch, warming_up=False)
     return (time.perf_counter() - start) * 1e3, metrics
 
 

@@ -70,7 +70,7 @@ def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
         "frames_per_batch": 4096,
         "minibatch_size": 512,
         "num_epochs": 4,
-        "warmup_batches": 0,
+        "warmup_batches": 1,
         "total_frames": 5_000_000,
     }
     assert cfg.optimizer.schedule.target_kl == 0.02
