@@ -1,3 +1,4 @@
+import json
 import math
 
 import pytest
@@ -273,3 +274,16 @@ def test_runs_of_the_demonstration_are_named_as_its_own(write_run):
     folder = write_run("demo/transfer", preset=None, demo__minutes=8)
     assert read_run(folder).preset == "demo"
     assert read_run(write_run("mine", preset=None)).preset == "unknown"
+
+
+def test_the_place_between_standing_still_and_the_ideal_is_averaged_over_seeds(write_run):
+    folders = [write_run(str(seed), seed=seed, task="dribble", score=0.5) for seed in range(2)]
+    (without,) = grouped(*folders)
+    assert without.reach == {}
+    for folder, place in zip(folders, (0.5, 0.7), strict=True):
+        found = json.loads((folder / "evaluation.json").read_text())
+        found["deterministic"]["reach"] = {"place": place, "standing": 0.2, "ideal": 0.6}
+        (folder / "evaluation.json").write_text(json.dumps(found))
+    (cell,) = grouped(*folders)
+    assert len(cell.complete) == 2
+    assert cell.reach == pytest.approx({"place": 0.6, "standing": 0.2, "ideal": 0.6})

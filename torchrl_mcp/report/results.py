@@ -236,7 +236,7 @@ def _is_evaluated(name: str, value: Any) -> bool:
     """Tell whether an evaluation may say this of a quantity."""
     if name == "interval":
         return isinstance(value, list) and len(value) == 2
-    if name in ("metrics", "diagnostics"):
+    if name in ("metrics", "diagnostics", "reach"):
         return isinstance(value, dict) and all(isinstance(number, int | float) for number in value.values())
     return isinstance(value, int | float)
 
