@@ -87,7 +87,7 @@ def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run
             "leave out preset=smoke logger=none num_threads=1 progress_bar=false device=cuda",
         ),
         (["training.minibatch_size=100"], "multiple"),
-        (["num_primitives=0"], "num_primitives must be at least 1"),
+        (["num_primitives=0"], "num_primitives=0 must be a whole number, at least 1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

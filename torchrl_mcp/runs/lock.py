@@ -13,10 +13,10 @@ from typing import IO
 LOCK = ".lock"
 """The file that is locked. It says who holds it, and is there only while somebody does, or was killed."""
 
-PAUSE = 0.1
+PAUSE = 0.05
 """Seconds between attempts."""
 
-ATTEMPTS = 5
+ATTEMPTS = 20
 """Before a lock counts as held: :func:`holder` takes it for a moment as well."""
 
 if sys.platform == "win32":
