@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
 from torchrl_mcp.runs.builtin import locate
 
 PROGRAM = "torchrl-mcp-export"
@@ -28,8 +28,10 @@ def main() -> None:
         path = locate(arguments.checkpoint)
         announce(PROGRAM)
         from torchrl_mcp.runs import export
+        from torchrl_mcp.runs.trust import trusting
 
-        policy, states = export.example(path)
+        with trusting(arguments.trust):
+            policy, states = export.example(path)
         if arguments.torch:
             export.write_torch(policy, states, arguments.torch)
             print(arguments.torch)
@@ -49,6 +51,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="CHECKPOINT",
         help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER",
     )
+    add_trust(parser)
     parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")
     parser.add_argument("--torch", type=Path, metavar="FILE", help="write a program for torch.export.load")
     return parser
