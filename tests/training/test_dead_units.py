@@ -41,6 +41,17 @@ def test_the_share_of_units_that_no_sample_activates_is_told_and_warned_of_once(
         watch(lambda: [network(samples) for network in networks.values()])
 
 
+@pytest.mark.parametrize(
+    ("network", "setting"), [("critic", "optimizer.critic.lr"), ("gating", "optimizer.schedule.max_lr")]
+)
+def test_the_warning_names_the_step_size_of_its_network(network, setting):
+    layers = nn.Sequential(nn.Linear(3, 10), nn.ReLU())
+    nn.init.constant_(layers[0].bias, -100.0)
+    watch = DeadUnits(nn.ModuleDict({network: layers}))
+    with pytest.warns(UserWarning, match=rf"100% of the hidden units of {network}\.1 .*\({setting}\)"):
+        watch(lambda: layers(torch.zeros(64, 3)))
+
+
 def test_units_that_one_sample_activates_are_alive_and_few_samples_judge_none(networks):
     watch, samples = DeadUnits(networks), torch.zeros(64, 3)
     with torch.no_grad():

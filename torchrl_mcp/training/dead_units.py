@@ -56,9 +56,10 @@ class DeadUnits:
         if share <= TOO_MANY or layer in self._warned:
             return
         self._warned.add(layer)
+        step_size = "optimizer.critic.lr" if layer.startswith("critic") else "optimizer.schedule.max_lr"
         warnings.warn(
             f"{share:.0%} of the hidden units of {layer} are zero for all samples and learn no more: "
-            "take smaller steps (optimizer.schedule.max_lr), or larger initial weights of the output (output_gain)",
+            f"take smaller steps ({step_size})",
             stacklevel=2,
         )
 
