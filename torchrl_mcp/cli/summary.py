@@ -1,6 +1,5 @@
 """What a run says when it ends: its numbers, its folder, and what to do next."""
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -8,10 +7,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS
-
-QUANTITY = "episode/normalised_return"
 
 
 def summary(folder: Path) -> str:
@@ -35,8 +33,7 @@ def last_return(folder: Path) -> float | None:
     """Return the normalised return of the last iteration of training in which an episode ended, None if none has."""
     if not (folder / METRICS).is_file():
         return None
-    with (folder / METRICS).open(newline="") as file:
-        returns = [float(row.get(QUANTITY) or "nan") for row in csv.DictReader(file)]
+    returns = [row.get(QUANTITY, math.nan) for row in read_metrics(folder)]
     return next((value for value in reversed(returns) if math.isfinite(value)), None)
 
 
@@ -51,6 +48,9 @@ def _returns(folder: Path) -> list[str]:
         for mode, numbers in modes.items()
     ]
     episodes = f"normalised return of {evaluation['episodes']} episodes, with its 95 % interval:"
+    if reach := modes["deterministic"].get("reach"):
+        standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
+        values.insert(1, f"{reach['place']:.0%} of the way from standing still, {standing}, to the ideal, {ideal}")
     return [episodes, *(f"  {value}" for value in [*values, *_paper(OmegaConf.load(folder / CONFIG))])]
 
 
