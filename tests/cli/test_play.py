@@ -45,7 +45,7 @@ def test_a_folder_without_checkpoint_is_refused(monkeypatch, tmp_path):
 
 def test_a_file_that_is_no_checkpoint_is_refused(monkeypatch, tmp_path):
     (tmp_path / "notes.txt").write_text("no checkpoint")
-    assert "notes.txt is not a checkpoint" in refused(monkeypatch, tmp_path / "notes.txt")
+    assert "notes.txt is damaged, or is not a checkpoint" in refused(monkeypatch, tmp_path / "notes.txt")
 
 
 def test_an_unknown_argument_of_the_task_is_refused_by_name(monkeypatch):

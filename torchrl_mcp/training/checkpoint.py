@@ -158,7 +158,7 @@ def _manifest(path: Path) -> Mapping[str, Any]:
         if "config" in manifest["metadata"]:
             return manifest
     except UNREADABLE as error:
-        raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: {error}") from error
+        raise ValueError(f"{path} is damaged, or is not a checkpoint of torchrl-mcp: {error}") from error
     raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: it holds no configuration")
 
 
