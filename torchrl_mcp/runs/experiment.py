@@ -39,9 +39,7 @@ def train(cfg: DictConfig) -> Path:
         ValueError: If the folder holds a run already, another process is at work on it, there is no environment for the
             configured task and character, or the configuration lacks the checkpoint to transfer from.
     """
-    build.require_valid(cfg)
-    build.require_environment(cfg)
-    build.require_equipment(cfg)
+    _require(cfg)
     with _held(Path(cfg.run_dir)), trusting(build.named(cfg)):
         return _train(cfg)
 
@@ -71,9 +69,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
         ValueError: As :func:`train` and :func:`resume`.
     """
     folder = Path(cfg.run_dir)
-    build.require_valid(cfg)
-    build.require_environment(cfg)
-    build.require_equipment(cfg)
+    _require(cfg)
     with _held(folder, wait=wait), trusting(build.named(cfg)):
         return _resume(folder) if (folder / CONFIG).exists() else _train(cfg)
 
@@ -221,6 +217,13 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
         raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
     _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, switch_interval=math.inf)
     return follow_each(agent.actor.policy, env)
+
+
+def _require(cfg: DictConfig) -> None:
+    """Check a configuration before a folder exists."""
+    build.require_valid(cfg)
+    build.require_environment(cfg)
+    build.require_equipment(cfg)
 
 
 @contextmanager
