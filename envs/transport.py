@@ -56,8 +56,8 @@ class Transport(TransferTask):
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Give the reward 1 while successful.
         emphasis: ``weights`` of the four terms and ``target_distance_power`` of the reward that is learnt from, in
-            which speeds count from standing still; None for the task's own. Of the printed reward, standing still
-            earns a third of the best, and who learns from it learns to stand.
+            which speeds count from standing still and every term is 1 while successful; None for the task's own. Of the
+            printed reward, standing still earns a third of the best, and who learns from it learns to stand.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: What the task remembers beside the object's position.
@@ -100,12 +100,12 @@ class Transport(TransferTask):
         """Where to find each quantity in ``goal``, by name."""
         self._shown = dict(things)
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
-        self._emphasised, self._idle = None, 0.0
+        self._emphasised, self._idle, self._full = None, 0.0, 1.0
         if emphasis is not None:
             if set(emphasis) != {"weights", "target_distance_power"} or len(emphasis["weights"]) != 4:
                 raise ValueError(f"emphasis={dict(emphasis)}: pass four weights and a target_distance_power")
             self._emphasised = partial(self._reward, **emphasis)
-            self._idle = idle_reward(emphasis["weights"], speed)
+            self._idle, self._full = idle_reward(emphasis["weights"], speed), sum(emphasis["weights"])
         super().__init__(
             character,
             num_envs,
@@ -208,7 +208,8 @@ class Transport(TransferTask):
             reward = reward.masked_fill(self.success(), 1.0)
         if self._emphasised is None:
             return reward.unsqueeze(0)
-        return torch.stack([reward, self._emphasised(*state) - self._idle])
+        emphasised = self._emphasised(*state).masked_fill(self.success(), self._full)
+        return torch.stack([reward, emphasised - self._idle])
 
     def arrows(self, index: int) -> list[Arrow]:
         """From above the character to the object, and from above the object to the target."""

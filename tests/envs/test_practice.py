@@ -55,6 +55,17 @@ def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
         np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
 
 
+def test_what_is_learnt_from_is_full_while_the_ball_is_at_its_target_and_the_character_near():
+    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
+    successes = torch.zeros(2)
+    for state, *_ in outcomes(make(Dribble, emphasis=EMPHASIS, **there), 60, push=1.0):
+        full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
+        success = state["success"][state["reward"] != 0]  # of those who have not fallen
+        assert torch.equal((state["reward"][state["reward"] != 0] - full).abs() < 1e-5, success)
+        successes += torch.stack([success.sum(), (~success).sum()])
+    assert (successes > 0).all()
+
+
 @every_task
 def test_the_task_reward_is_that_of_the_task_without_emphasis(task):
     emphasised = outcomes(make(task, emphasis=EMPHASIS))
