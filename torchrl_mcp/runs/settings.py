@@ -60,87 +60,48 @@ RANGE = Rule(
     lambda value: _is_list(value, _is_number) and len(value) == 2 and value[0] <= value[1],
 )
 
-RULES: dict[str, Rule] = {
-    **dict.fromkeys(
-        (
-            *("num_envs", "frames_per_batch", "minibatch_size", "num_epochs", "total_frames", "batch_factor"),
-            *("checkpoint_interval", "keep_checkpoints", "max_episode_steps", "num_workers", "switch_candidates"),
-            *("num_primitives", "num_options", "latent_dim", "steps_per_choice", "explorer.steps"),
-        ),
-        COUNT,
-    ),
-    **dict.fromkeys(("num_threads", "branch_cells", "warmup_batches", "evaluation.episodes"), WHOLE),
-    **dict.fromkeys(("torch_threads", "record_interval"), COUNT.or_null()),
-    "seed": SEED,
-    **dict.fromkeys(
-        (
-            *("lr", "min_lr", "max_lr", "target_kl", "clip_epsilon", "advantages.clip", "action_std", "initial_std"),
-            *("std", "logits_std", "scale", "reach", "max_error", "width"),
-        ),
-        POSITIVE,
-    ),
-    **dict.fromkeys(("max_grad_norm", "physics_timestep"), POSITIVE.or_null()),
-    "switch_interval": PERIOD,
-    **dict.fromkeys(
-        (
-            *("bound_coeff", "coeff", "kl_coeff", "termination_cost", "weight", "failure_weighting", "speed"),
-            *("max_turn", "slope", "target_distance_power", "reset_noise_scale"),
-            *("forward_weight", "healthy_weight", "control_weight", "contact_weight"),
-        ),
-        NOT_NEGATIVE,
-    ),
-    **dict.fromkeys(
-        (
-            *("gamma", "lmbda", "discount", "epsilon", "momentum", "terminations.initial"),
-            *("initial_states.rest", "initial_states.motions"),
-        ),
-        SHARE,
-    ),
-    **dict.fromkeys(
-        (
-            *(
-                "progress_bar",
-                "fused",
-                "entropy_bonus",
-                "functional",
-                "contact_forces",
-                "self_collision",
-                "learned_std",
-            ),
-            *(
-                "terminate_on_fall",
-                "terminate_when_unhealthy",
-                "success_reward",
-                "parts.blind",
-                "regret_per_step",
-                "staggered",
-            ),
-        ),
-        FLAG,
-    ),
-    **dict.fromkeys(
-        (
-            *("healthy_z_range", "initial_directions", "object_distances", "object_directions", "target_distances"),
-            *(
-                "target_directions",
-                "evaluation.directions",
-                *("environment.directions", "directions.pretrain", "directions.transfer"),
-                "pretrain.directions",
-                "transfer.directions",
-            ),
-        ),
-        RANGE,
-    ),
-    **dict.fromkeys(("num_cells", "state_cells", "goal_cells", "joint_cells", "trunk_cells", "values_cells"), WIDTHS),
-    **dict.fromkeys(("transfer.freeze", "transfer.keep"), NAMES),
-    **dict.fromkeys(("device", "run_dir", "run_root"), TEXT),
-    **dict.fromkeys(("pretrained", "resume"), TEXT.or_null()),
-    "autocast": _among(True, False, "auto"),
-    "switch_to": _among("any", "same"),
-    "friction_cone": _among("pyramidal", "elliptic"),
-    "emphasis.weights": WEIGHTS,
-    "practice.max_episode_steps": COUNT.or_null(),
+NAMES_BY_RULE: dict[Rule, str] = {
+    COUNT: """
+        num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor checkpoint_interval
+        keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options latent_dim
+        steps_per_choice explorer.steps
+    """,
+    COUNT.or_null(): "torch_threads record_interval practice.max_episode_steps",
+    WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
+    SEED: "seed",
+    POSITIVE: """
+        lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale reach
+        max_error width
+    """,
+    POSITIVE.or_null(): "max_grad_norm physics_timestep",
+    PERIOD: "switch_interval",
+    NOT_NEGATIVE: """
+        bound_coeff coeff kl_coeff termination_cost weight failure_weighting speed max_turn slope
+        target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
+    """,
+    SHARE: """
+        gamma lmbda discount epsilon momentum terminations.initial initial_states.rest initial_states.motions
+    """,
+    FLAG: """
+        progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
+        terminate_when_unhealthy success_reward parts.blind regret_per_step staggered
+    """,
+    RANGE: """
+        healthy_z_range initial_directions object_distances object_directions target_distances target_directions
+        evaluation.directions environment.directions directions.pretrain directions.transfer pretrain.directions
+        transfer.directions
+    """,
+    WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
+    WEIGHTS: "emphasis.weights",
+    NAMES: "transfer.freeze transfer.keep",
+    TEXT: "device run_dir run_root",
+    TEXT.or_null(): "pretrained resume",
+    _among(True, False, "auto"): "autocast",
+    _among("any", "same"): "switch_to",
+    _among("pyramidal", "elliptic"): "friction_cone",
 }
+
+RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}
 """By the end of a setting's path: what is called alike means the same wherever it stands."""
 
 GROUPS = ("task", "stage", "character", "method", "training", "evaluation", "optimizer", "objective", "transfer")
