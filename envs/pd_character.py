@@ -190,7 +190,16 @@ class PDCharacterEnv(CharacterEnv):
 
 
 def add_ground(spec: mujoco.MjSpec) -> None:
-    """Add flat ground and light to a character's scene."""
+    """Add flat ground, sky and light to a character's scene."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=64,
+        height=6 * 64,
+        rgb1=[0.45, 0.62, 0.82],
+        rgb2=[0.87, 0.90, 0.94],
+    )
     spec.add_texture(
         name="ground",
         type=mujoco.mjtTexture.mjTEXTURE_2D,

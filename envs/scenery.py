@@ -14,6 +14,9 @@ from torchrl_mcp.envs.rendering import Shape, arrow, ghost
 HAZE = (0.87, 0.90, 0.94, 1.0)
 """Colour into which the ground fades."""
 
+ZENITH = (0.45, 0.62, 0.82)
+"""Colour of the sky above; at the horizon and below it is that of the haze."""
+
 GROUND = (150, 205)
 """Darkest and lightest pixel of the ground, of 255."""
 
@@ -43,7 +46,8 @@ def reference(env: Imitation, index: int = 0) -> Tensor:
 def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a copy of a scene in soft light, whose ground is pale, mirrors nothing and fades into :data:`HAZE`.
 
-    The haze is drawn where a scene's flag ``mjRND_FOG`` is set.
+    The sky, if it has one, is :data:`ZENITH` above and as the haze at the horizon and below. The haze is drawn where a
+    scene's flag ``mjRND_FOG`` is set.
     """
     model = copy.copy(model)
     light = model.vis.headlight
@@ -56,7 +60,23 @@ def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).tolist():
         _extend(model, plane)
         _fade(model, plane)
+    for sky in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).tolist():
+        pixels = _pixels(model, sky)
+        pixels[:] = sky_picture(model.tex_width[sky])[..., : model.tex_nchannel[sky]].reshape(-1)
     return model
+
+
+def sky_picture(width: int) -> np.ndarray:
+    """Return the six faces of a cube of sky, one below the other as MuJoCo has them, ``(6 * width, width, 3)``, uint8.
+
+    Right, left, up, down, front and back; the first row of those at the sides is the uppermost.
+    """
+    side = (2 * np.arange(width) + 1) / width - 1
+    away = np.sqrt(1 + side[:, None] ** 2 + side**2)
+    heights = {"side": -side[:, None] / away, "up": 1 / away, "down": -1 / away}  # sines of the elevation
+    faces = [heights[face] for face in ("side", "side", "up", "down", "side", "side")]
+    share = np.concatenate(faces).clip(0, 1)[..., None]
+    return np.round(255 * ((1 - share) * HAZE[:3] + share * ZENITH)).astype(np.uint8)
 
 
 def extent(model: mujoco.MjModel) -> float:
@@ -82,6 +102,11 @@ def _fade(model: mujoco.MjModel, plane: int) -> None:
     material = model.geom_matid[plane]
     texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
     if texture >= 0:
-        size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
-        pixels = model.tex_data[model.tex_adr[texture] :][:size]
+        pixels = _pixels(model, texture)
         pixels[:] = pixels.clip(*GROUND)
+
+
+def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
+    """Return the pixels of a texture, a live view of one dimension."""
+    size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+    return model.tex_data[model.tex_adr[texture] :][:size]

@@ -170,7 +170,7 @@ def test_holdout_draws_trajectories_by_direction_and_curves(runs, tmp_path, monk
         ("holdout", ["mcp"], "task=imitation: Figure 5 is of task=holdout"),
         ("exploration", ["mcp", "mcp"], "a checkpoint is named twice"),
         ("exploration", ["nothing"], "there is no nothing: give a run folder"),
-        ("exploration", ["builtin:horse"], "no network for method=mcp and character=horse"),
+        ("exploration", ["builtin:horse"], "no builtin:horse comes with the library"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_by_name(command, names, message, runs, tmp_path, monkeypatch):

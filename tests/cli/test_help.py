@@ -48,7 +48,7 @@ def test_each_command_says_its_version(command):
     ("command", "words", "answer"),
     [
         ("torchrl-mcp-play", ["nowhere"], "there is no nowhere: give a run folder"),
-        ("torchrl-mcp-play", ["builtin:horse"], "only mcp-biped, mcp-humanoid, mcp-trex"),
+        ("torchrl-mcp-play", ["builtin:horse"], "no builtin:horse comes with the library: give one of builtin:biped"),
         ("torchrl-mcp-evaluate", ["nowhere"], "there is no nowhere: give a run folder"),
         ("torchrl-mcp-figures", ["primitives", "nowhere"], "there is no nowhere: give a run folder"),
         ("torchrl-mcp-motions", ["inspect", "nowhere.bvh"], "there is no nowhere.bvh"),

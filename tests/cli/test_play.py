@@ -35,8 +35,8 @@ def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_fo
 
 def test_unknown_networks_are_refused_by_those_that_there_are(monkeypatch):
     said = refused(monkeypatch, "builtin:horse")
-    assert "character=horse comes with the library" in said
-    assert all(f"mcp-{name}" in said for name in ("biped", "humanoid", "trex"))
+    assert "no builtin:horse comes with the library" in said
+    assert all(f"builtin:{name}" in said for name in ("biped", "humanoid", "trex"))
 
 
 def test_a_folder_without_checkpoint_is_refused(monkeypatch, tmp_path):
@@ -103,3 +103,10 @@ def test_without_an_agent_one_checkpoint_is_asked_for(monkeypatch, capsys):
 
 def test_an_unknown_setting_of_an_agents_environment_is_refused_without_a_traceback(monkeypatch):
     assert "task/nope" in refused(monkeypatch, "--agent", "zero", "task=nope")
+
+
+@pytest.mark.parametrize("words", [["builtin:biped", "--viewer", "web"], ["."], ["--agent", "zero", "--viewer", "web"]])
+def test_watching_needs_a_run_folder_and_a_viewer(monkeypatch, capsys, words):
+    with pytest.raises(SystemExit):
+        call(monkeypatch, "--watch", *words)
+    assert "--watch takes a run folder, and --viewer web or --viewer window" in capsys.readouterr().err

@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.rendering import arrow
-from torchrl_mcp.envs.scenery import extent, scenery, softly_lit
+from torchrl_mcp.envs.rendering import Camera, arrow
+from torchrl_mcp.envs.scenery import HAZE, ZENITH, extent, scenery, sky_picture, softly_lit
 
 
 def turn():
@@ -129,7 +129,11 @@ def test_softly_lit_ground_is_pale_and_endless_and_mirrors_nothing():
     start = model.tex_adr[texture]
     end = start + model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
     assert model.tex_data[start:end].min() < 50 < 140 < lit.tex_data[start:end].min()
-    assert np.array_equal(np.delete(lit.tex_data, slice(start, end)), np.delete(model.tex_data, slice(start, end)))
+    others = np.ones(len(lit.tex_data), bool)
+    for changed in {texture, *np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)}:
+        size = model.tex_height[changed] * model.tex_width[changed] * model.tex_nchannel[changed]
+        others[model.tex_adr[changed] :][:size] = False
+    assert np.array_equal(lit.tex_data[others], model.tex_data[others])
     assert not lit.mat_reflectance.any()
     assert not lit.geom_size[floor, :2].any()
 
@@ -137,3 +141,40 @@ def test_softly_lit_ground_is_pale_and_endless_and_mirrors_nothing():
 def test_a_plain_ground_can_be_softly_lit_too():
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom type='plane' size='9 9 1'/></worldbody></mujoco>")
     assert not softly_lit(model).geom_size[0, :2].any()
+
+
+@pytest.mark.parametrize(
+    "env",
+    [Heading("biped", 1, seed=0, num_threads=1), Holdout(1, (0.0, 0.0), seed=0, num_threads=1)],
+    ids=["biped", "ant"],
+)
+@pytest.mark.parametrize(("azimuth", "height"), [(0.0, 3.0), (90.0, 3.0), (200.0, 40.0), (0.0, -4.0), (90.0, -40.0)])
+def test_the_sky_is_no_night_from_any_camera(env, azimuth, height):
+    model = softly_lit(env.simulation.model)
+    try:
+        camera = Camera(model, width=96, height=96)
+    except (RuntimeError, mujoco.FatalError) as error:
+        pytest.skip(str(error))
+    camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera.view.azimuth, camera.view.lookat = azimuth, [60.0, 20.0, height]  # far from the character
+    for fog in (False, True):
+        camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = fog
+        for elevation in (-10.0, 0.0, 30.0, 80.0):
+            camera.view.elevation = -elevation
+            assert camera.picture(data, distance=2.0).float().mean(-1).min() > 60
+    camera.close()
+
+
+def test_the_sky_is_of_the_haze_at_the_horizon_and_below_and_bluer_above():
+    sky = sky_picture(64).reshape(6, 64, 64, 3)
+    haze = np.round(255 * np.array(HAZE[:3]))
+    for side in (0, 1, 4, 5):
+        assert (sky[side, 32:] == haze).all()
+        assert np.abs(sky[side, 31] - haze).max() < 5
+        assert (np.diff(sky[side, :, 32, 0].astype(int)) >= 0).all()  # from above, ever less blue
+    assert (sky[3] == haze).all()
+    np.testing.assert_allclose(sky[2, 31:33, 31:33].mean((0, 1)), 255 * np.array(ZENITH), atol=1.0)
+    # Faces meet without a seam: the lowest of the upper one is the highest of those at the sides.
+    assert np.abs(sky[2, 0].astype(int) - sky[4, 0]).max() < 5

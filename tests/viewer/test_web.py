@@ -17,7 +17,8 @@ pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.viewer.guard import refusal
 from torchrl_mcp.viewer.player import Player
-from torchrl_mcp.viewer.web import Pace, Stage, play_in_browser
+from torchrl_mcp.viewer.steering import Steering
+from torchrl_mcp.viewer.web import Deed, Hands, Pace, Stage, play_in_browser
 
 IDLE = TensorDictModule(lambda goal: torch.zeros(len(goal), 17), in_keys=["goal"], out_keys=["action"])
 
@@ -87,7 +88,8 @@ def test_a_page_shows_the_character_while_it_plays(monkeypatch, tmp_path):
 
 
 def test_what_is_beside_the_simulation_is_drawn_where_it_is():
-    stage, player = Stage(distance=3.0), Brief()
+    player = Brief()
+    stage = Stage(Steering(player), distance=3.0)
     stage.viewer, stage.shapes = SimpleNamespace(extra_geoms=["an old one"]), player.shapes
     stage.on_update(None)
     [geom], [shape] = stage.viewer.extra_geoms, player.shapes
@@ -96,8 +98,9 @@ def test_what_is_beside_the_simulation_is_drawn_where_it_is():
 
 
 def test_the_camera_follows_the_first_body():
-    stage = Stage(distance=3.0)
-    stage.viewer = SimpleNamespace(model=Brief().env.simulation.model, camera=mujoco.MjvCamera())
+    player = Brief()
+    stage = Stage(Steering(player), distance=3.0)
+    stage.viewer = SimpleNamespace(model=player.env.simulation.model, camera=mujoco.MjvCamera())
     stage.align_camera()
     camera = stage.viewer.camera
     assert (camera.type, camera.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
@@ -111,6 +114,18 @@ def test_the_pace_is_what_the_controls_say():
     assert (pace.paused, pace.speed) == (False, 1.0)
     pace.on_step_control(messages.StepControlSnapshot(sim.PauseState.NORMAL_PAUSED, 50.0, 0.0, 0.0))
     assert (pace.paused, pace.speed) == (True, 0.5)
+
+
+def test_what_is_done_in_the_browser_is_done_to_the_player():
+    from mujoco.experimental.studio import messages
+
+    steering = Steering(Brief())
+    hands = Hands(steering)
+    hands.on_deed(Deed(lambda steering: steering.aim(1.0)))
+    assert steering.direction == 1.0
+    steering.step()
+    hands.on_reset(messages.ResetEvent(key=-1))
+    assert steering.player.began
 
 
 def test_the_page_is_for_this_machine_and_its_own_address_alone(monkeypatch, tmp_path):

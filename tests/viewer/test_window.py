@@ -1,4 +1,5 @@
 import contextlib
+import math
 
 import mujoco
 import mujoco.viewer
@@ -7,9 +8,10 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from torchrl_mcp.envs import Heading
+from torchrl_mcp.envs import Dribble, Heading
 from torchrl_mcp.viewer.player import Player, Weights
-from torchrl_mcp.viewer.window import LENGTH, as_text, play_in_window
+from torchrl_mcp.viewer.steering import Steering
+from torchrl_mcp.viewer.window import LENGTH, as_text, grasp, play_in_window
 
 GATED = TensorDictModule(
     lambda goal: (torch.zeros(len(goal), 17), torch.tensor([[1.0, 0.5]])),
@@ -21,11 +23,13 @@ GATED = TensorDictModule(
 class Window:
     """What MuJoCo's window shows while it is open for some steps."""
 
-    def __init__(self, steps):
+    def __init__(self, steps, pressed=()):
         self.cam, self.texts, self.seen = mujoco.MjvCamera(), [], []
-        self.steps, self.lock = steps, contextlib.nullcontext
+        self.steps, self.lock, self.perturb = steps, contextlib.nullcontext, mujoco.MjvPerturb()
+        self.pressed = dict(pressed)  # by the number of pictures before it
 
-    def open(self, model, data, **_):
+    def open(self, model, data, key_callback, **_):
+        self.press = key_callback
         self.model, self.data, self.user_scn = model, data, mujoco.MjvScene(model, 100)
         return contextlib.nullcontext(self)
 
@@ -37,25 +41,66 @@ class Window:
 
     def sync(self):
         self.seen.append((self.data.time, self.data.qpos.copy(), self.user_scn.ngeom))
+        if key := self.pressed.get(len(self.seen)):
+            self.press(key)
 
 
 @pytest.fixture
-def window(monkeypatch):
-    window = Window(3)
+def opened(monkeypatch):
+    """Plays in a window for a while."""
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", window.open)
-    return window
+
+    def play(window, player):
+        monkeypatch.setattr(mujoco.viewer, "launch_passive", window.open)
+        play_in_window(player)
+        return window
+
+    return play
 
 
-def test_the_window_shows_every_control_step_until_it_is_closed(window):
-    player = Player(GATED, Heading("biped", 1, seed=0, num_threads=1))
-    play_in_window(player)
+def player(task=Heading, **settings):
+    return Player(GATED, task("biped", 1, seed=0, num_threads=1, **settings))
+
+
+def test_the_window_shows_every_control_step_until_it_is_closed(opened):
+    walker = player()
+    window = opened(Window(3), walker)
     times, states, shapes = zip(*window.seen, strict=True)
     np.testing.assert_allclose(times, [1 / 30, 2 / 30, 3 / 30], rtol=1e-6)
-    np.testing.assert_allclose(states[-1], player.data.qpos)
+    np.testing.assert_allclose(states[-1], walker.data.qpos)
     assert shapes == (1, 1, 1)  # the arrow, and not one more with every step
     assert window.texts[-1][2:] == as_text(Weights("gates", [1.0, 0.5]))
     assert window.cam.trackbodyid == 1
+
+
+def test_keys_pause_go_on_turn_and_begin_anew(opened):
+    space, left, backspace = ord(" "), 263, 259
+    walker = player(max_turn=0.0)
+    window = opened(Window(7, {1: space, 3: space, 4: left, 6: backspace}), walker)
+    times = [round(30 * time) for time, *_ in window.seen]
+    assert times == [1, 1, 1, 2, 3, 4, 1]
+    [(tail, tip)] = walker.env.arrows(0)
+    assert math.degrees(math.atan2(*(tip - tail)[1::-1])) == pytest.approx(15)
+
+
+def test_what_the_mouse_drags_is_pushed_and_where_it_chose_the_ground_the_target_goes():
+    ball = player(Dribble)
+    steering, model = Steering(ball), ball.env.simulation.model
+    data, hand = mujoco.MjData(model), mujoco.MjvPerturb()
+    mujoco.mj_forward(model, data)
+    hand.localpos[:] = 2.0, 1.0, 0.0
+    grasp(steering, model, data, hand)
+    assert steering.place == (2.0, 1.0)
+    pushed = ball.env.simulation.state["xfrc_applied"][0]
+    assert not pushed.any()
+    torso = model.body("torso").id
+    hand.select, hand.active, hand.localmass = torso, int(mujoco.mjtPertBit.mjPERT_TRANSLATE), 1.0
+    hand.localpos[:], hand.refselpos[:] = 0.0, data.xpos[torso] + [0.0, 0.5, 0.0]
+    grasp(steering, model, data, hand)
+    force = pushed[torso, :3].numpy()
+    assert force[1] > 1.0  # towards the hand
+    assert np.abs(force[[0, 2]]).max() < 1e-6 * force[1]
+    assert not np.delete(pushed.numpy(), torso, axis=0).any()
 
 
 def test_weights_are_strokes_beside_the_numbers_of_their_primitives():

@@ -69,7 +69,9 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(PROGRAM, "Play episodes with a trained policy: returns, and diagnostics of gates and options.")
     parser.add_argument(
-        "checkpoint", help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER"
+        "checkpoint",
+        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
+        "builtin:CHARACTER-TASK",
     )
     parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
     parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")

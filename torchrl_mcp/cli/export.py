@@ -49,7 +49,8 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "checkpoint",
         metavar="CHECKPOINT",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER",
+        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
+        "builtin:CHARACTER-TASK",
     )
     add_trust(parser)
     parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")

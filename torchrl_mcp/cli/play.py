@@ -12,8 +12,9 @@ PROGRAM = "torchrl-mcp-play"
 EXAMPLES = f"""\
 examples:
   {PROGRAM} builtin:humanoid                              # a film of the networks that come with the library
+  {PROGRAM} builtin:humanoid-heading --viewer web         # steer in a browser: arrow keys, gates, pushes
   {PROGRAM} runs/my-run --output walk.mp4 --seconds 20 --width 1280 --height 720
-  {PROGRAM} runs/my-run --viewer web                      # in a browser, with MuJoCo Studio
+  {PROGRAM} --watch runs/my-run --viewer web              # a run in training: each new checkpoint is taken up
   {PROGRAM} --agent random task=carry character=humanoid  # look at an environment before training
   {PROGRAM} runs/my-imitation --task switch_interval=.inf --task clip_end=switch
 """
@@ -48,6 +49,8 @@ def parse(words: list[str]) -> argparse.Namespace:
         if len(arguments.settings) != 1:
             options.error(f"give one CHECKPOINT, not {len(arguments.settings)}; or --agent, and task=... character=...")
         arguments.checkpoint = arguments.settings[0]
+    if arguments.watch and (arguments.agent or not arguments.viewer or not Path(arguments.checkpoint).is_dir()):
+        options.error("--watch takes a run folder, and --viewer web or --viewer window")
     return arguments
 
 
@@ -58,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
         "checkpoint",
         nargs="*",
         metavar="CHECKPOINT",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, or builtin:CHARACTER; with --agent "
-        "settings of an environment instead, as torchrl-mcp-train takes them",
+        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
+        "builtin:CHARACTER-TASK; with --agent settings of an environment instead, as torchrl-mcp-train takes them",
     )
     add_trust(parser)
     parser.add_argument("--agent", choices=["zero", "random"], help="actions of zero, or random ones: nothing trained")
@@ -88,6 +91,9 @@ def parser() -> argparse.ArgumentParser:
         "--viewer",
         choices=["web", "window"],
         help="show it live instead: in a browser on this machine, or in a window",
+    )
+    viewer.add_argument(
+        "--watch", action="store_true", help="of a run folder in training: play each new checkpoint as it comes"
     )
     viewer.add_argument("--port", type=int, default=0, help="of the page (default: the first free one from 8080)")
     viewer.add_argument(

@@ -1,6 +1,8 @@
 """A policy in a film, in a browser or in a window."""
 
 import argparse
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -12,16 +14,23 @@ from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.build import Agent
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.viewer.watch import Watch
 
 
 def play(arguments: argparse.Namespace) -> None:
     """Write a film, or open a viewer until it is closed."""
     torch.manual_seed(arguments.seed)
-    restored = _restored(arguments) if arguments.agent is None else _agent(arguments)
-    show(*restored, arguments)
+    if arguments.agent is not None:
+        show(*_agent(arguments), 0, arguments)
+        return
+    agent, env = _restored(arguments)
+    options = agent.actor.num_options if isinstance(agent.actor, OptionActor) else 0
+    watch = Watch(Path(arguments.checkpoint), agent.parts) if arguments.watch else None
+    show(agent.actor.policy, env, options, arguments, before_step=watch)
 
 
 def show(
@@ -29,6 +38,8 @@ def show(
     env: CharacterEnv | TransformedCharacterEnv,
     options: int,
     arguments: argparse.Namespace,
+    *,
+    before_step: Callable[[], object] | None = None,
 ) -> None:
     """Write a film of a policy, or open a viewer until it is closed.
 
@@ -37,6 +48,7 @@ def show(
         env: The environment.
         options: Number of options among which the policy chooses, 0 if it does not.
         arguments: The command line.
+        before_step: What a viewer does before each step.
     """
     look: dict[str, Any] = {
         "deterministic": not arguments.stochastic,
@@ -53,25 +65,27 @@ def show(
                 from torchrl_mcp.viewer.web import play_in_browser  # slow to load, as is the window
             except ImportError as error:
                 raise RuntimeError(f"Studio is not where mujoco 3.17 has it, install that: {error}") from error
-            play_in_browser(Player(policy, env, **look), port=arguments.port, host=arguments.host)
+            play_in_browser(
+                Player(policy, env, before_step=before_step, **look), port=arguments.port, host=arguments.host
+            )
         case "window":
             from torchrl_mcp.viewer.window import play_in_window
 
-            play_in_window(Player(policy, env, **look))
+            play_in_window(Player(policy, env, before_step=before_step, **look))
 
 
-def _restored(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv, int]:
-    """Return the policy of a checkpoint, an environment with some arguments of its task replaced, and its options."""
+def _restored(arguments: argparse.Namespace) -> tuple[Agent, CharacterEnv]:
+    """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
     path, settings = locate(arguments.checkpoint), _task_settings(arguments)
     try:
         _, agent, env = experiment.restore(path, num_envs=1, seed=arguments.seed, **settings)
     except TypeError as error:
         raise ValueError(f"--task {' '.join(arguments.task)}: {error}") from error
-    return agent.actor.policy, env, agent.actor.num_options if isinstance(agent.actor, OptionActor) else 0
+    return agent, env
 
 
-def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv, int]:
-    """Return a policy that has learnt nothing, the environment of a configuration, and no options."""
+def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv]:
+    """Return a policy that has learnt nothing, and the environment of a configuration."""
     own = [f"hydra.searchpath=[file://{arguments.config_dir.resolve()}]"] if arguments.config_dir else []
     try:
         cfg = build.compose_run(*own, *arguments.settings)
@@ -82,7 +96,7 @@ def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Charact
     env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **_task_settings(arguments))
     act = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[arguments.agent]
     policy = TensorDictModule(lambda observation: act(), in_keys=["observation"], out_keys=["action"])
-    return policy, env, 0
+    return policy, env
 
 
 def _task_settings(arguments: argparse.Namespace) -> dict[str, Any]:

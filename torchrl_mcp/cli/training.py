@@ -10,7 +10,6 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from torchrl_mcp.cli.parsing import announce
-from torchrl_mcp.cli.summary import final_return, summary
 from torchrl_mcp.training.run_folder import CONFIG
 
 PROGRAM = "torchrl-mcp-train"
@@ -20,6 +19,7 @@ PROGRAM = "torchrl-mcp-train"
 def run(cfg: DictConfig) -> float | None:
     """Train as ``cfg`` says, or continue ``cfg.resume``, and return the final return, which sweepers optimise."""
     announce(PROGRAM)
+    from torchrl_mcp.cli.summary import final_return, summary
     from torchrl_mcp.runs import experiment
 
     try:

@@ -22,7 +22,7 @@ from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import provenance
-from torchrl_mcp.runs.publish import publish
+from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
 from torchrl_mcp.runs.trust import read_config, trusting
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.precision import choose, name
@@ -134,6 +134,8 @@ def restore(
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
     agent = make_agent(cfg, env)
+    if checkpoint.shared(file):
+        take_shared(agent.parts, file, builtin(cfg.method.name, cfg.character.name))
     checkpoint.load_agent(agent.parts, file)
     return cfg, agent, env
 
@@ -141,17 +143,22 @@ def restore(
 def publish_run(path: Path, output: Path) -> None:
     """Write the policy of a run as a checkpoint file of its own, as small as those that come with the library.
 
+    Of a run that transferred from the networks that come with the library, it leaves out what training froze of them.
+
     Args:
         path: Run folder, of which the newest checkpoint counts, or checkpoint file.
         output: The file to write.
 
     Raises:
-        ValueError: If there is no checkpoint or it is damaged.
+        ValueError: If there is no checkpoint, it is damaged, or the library's networks are not what was frozen.
     """
     cfg, agent, _ = restore(path, num_envs=1, seed=0)
     cfg.run_dir = cfg.run_root = "runs"  # where it lay is of no use to others
     parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
-    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output)
+    shared: dict[str, str] = {}
+    if cfg.stage.name == "transfer" and cfg.pretrained == "builtin":
+        shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
+    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output, shared=shared)
 
 
 def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:

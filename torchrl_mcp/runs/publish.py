@@ -1,17 +1,24 @@
-"""Checkpoints for others: the policy alone, as small as those that come with the library."""
+"""Checkpoints for others: the policy alone, as small as those that come with the library.
+
+A gate that was trained over primitives that come with the library is published without them: the file names these
+*shared* parts by their fingerprints, and whoever restores it takes them from the library's own networks.
+"""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from torchrl_mcp.training.checkpoint import run_checkpoint
+from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.transfer import fingerprint
 
 
-def publish(parts: nn.ModuleDict, config: Mapping[str, Any], path: Path) -> None:
+def publish(
+    parts: nn.ModuleDict, config: Mapping[str, Any], path: Path, *, shared: Mapping[str, str] | None = None
+) -> None:
     """Write parts of an agent, parameters rounded to bfloat16, as a checkpoint to play or to transfer from.
 
     Networks that run in bfloat16 autocast round their parameters anyway.
@@ -20,9 +27,53 @@ def publish(parts: nn.ModuleDict, config: Mapping[str, Any], path: Path) -> None
         parts: What to write, by name.
         config: The run's configuration.
         path: The file; its folder is made.
+        shared: Fingerprints of parts that others hold, by name. They are left out.
     """
-    rounded = copy.deepcopy(parts)
-    for parameter in rounded.parameters():
+    shared = dict(shared or {})
+    own = copy.deepcopy(nn.ModuleDict({name: part for name, part in parts.items() if name not in shared}))
+    for parameter in own.parameters():
         parameter.data = parameter.data.to(torch.bfloat16)
     path.parent.mkdir(parents=True, exist_ok=True)
-    run_checkpoint(rounded).save(path, metadata={"config": config})
+    checkpoint.run_checkpoint(own).save(path, metadata={"config": config, "shared": shared})
+
+
+def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> dict[str, str]:
+    """Return the fingerprints of parts that are to the bit those of a checkpoint file.
+
+    Args:
+        parts: Parts of an agent.
+        names: Which of them to compare.
+        origin: The file.
+
+    Raises:
+        ValueError: If one differs, or the file does not hold it.
+    """
+    held = nn.ModuleDict({name: copy.deepcopy(parts[name]) for name in names})
+    checkpoint.load_parts(held, names, origin)
+    own = {name: fingerprint(parts[name]) for name in names}
+    if differing := [name for name in names if fingerprint(held[name]) != own[name]]:
+        raise ValueError(
+            f"the policy was trained over other {' and '.join(differing)} than {origin.name} holds, which come with "
+            "the library: train it again with pretrained=builtin"
+        )
+    return own
+
+
+def take_shared(parts: nn.ModuleDict, path: Path, origin: Path) -> None:
+    """Restore the parts that a published file leaves to the library's own networks.
+
+    Args:
+        parts: Parts of an agent.
+        path: The published file.
+        origin: The library's file.
+
+    Raises:
+        ValueError: If the library's networks are others than those that the policy was trained over.
+    """
+    expected = checkpoint.shared(path)
+    checkpoint.load_parts(parts, expected, origin)
+    if differing := [name for name, mark in expected.items() if fingerprint(parts[name]) != mark]:
+        raise ValueError(
+            f"{path} needs other {' and '.join(differing)} than {origin.name} holds in this version of torchrl-mcp: "
+            "use the version that it was published with"
+        )

@@ -77,13 +77,15 @@ def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None
 
 
 def load_agent(parts: nn.ModuleDict, path: Path) -> None:
-    """Restore all parts of an agent from the checkpoint file ``path``, but for a critic that the file does not hold.
+    """Restore all parts of an agent from the checkpoint file ``path``, but for those that it need not hold.
+
+    These are the critic, and what the file says to be :func:`shared`.
 
     Raises:
         ValueError: As :func:`load`.
     """
-    held = _manifest(path)["components"]
-    load_parts(parts, [name for name in parts if name != "critic" or _component(name) in held], path)
+    held, optional = _manifest(path)["components"], {"critic", *shared(path)}
+    load_parts(parts, [name for name in parts if name not in optional or _component(name) in held], path)
 
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
@@ -148,6 +150,15 @@ def saved_config(path: Path) -> Mapping[str, Any]:
         ValueError: If the file is not a checkpoint of this library.
     """
     return _manifest(path)["metadata"]["config"]
+
+
+def shared(path: Path) -> Mapping[str, str]:
+    """Return the parts that the checkpoint file ``path`` lacks because other networks hold them, with fingerprints.
+
+    Raises:
+        ValueError: If the file is not a checkpoint of this library.
+    """
+    return _manifest(path)["metadata"].get("shared", {})
 
 
 def _manifest(path: Path) -> Mapping[str, Any]:

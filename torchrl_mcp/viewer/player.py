@@ -1,10 +1,12 @@
 """The player that viewers share: a policy in one simulation, step by step."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs import CharacterEnv
@@ -34,11 +36,14 @@ class Player:
         deterministic: Play the deterministic action rather than a sample.
         num_options: Number of options among which the policy chooses, 0 if it does not.
         aside: How far beside the character to draw a ghost, in units of the character's extent.
+        before_step: What to do before each step, such as taking up what training has learnt since.
 
     Attributes:
         env: The environments without transforms.
         extent: How far the character extends from its centre of mass, in metres.
         began: Whether an episode has just begun.
+        state: What the environment shows.
+        pinned: Weights of primitives, by number from 0, that replace those of the gate.
     """
 
     def __init__(
@@ -49,23 +54,49 @@ class Player:
         deterministic: bool = True,
         num_options: int = 0,
         aside: float = 1.0,
+        before_step: Callable[[], object] | None = None,
     ) -> None:
         self.env: CharacterEnv = env.base_env if isinstance(env, TransformedCharacterEnv) else env
         self.extent = extent(self.env.simulation.model)
-        self.began = True
+        self.pinned: dict[int, float] = {}
         self._policy, self._transformed, self._num_options = policy, env, num_options
         self._exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-        self._aside = aside * self.extent
-        self._state = env.reset()
-        self._decision = self._state.empty()
+        self._aside, self._before_step = aside * self.extent, before_step
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self.state = self._transformed.reset()
+        self._decision = self.state.empty()
+        self.began = True
 
     @torch.no_grad()
     def step(self) -> None:
         """Let the policy act once."""
+        if self._before_step is not None:
+            self._before_step()
         with set_exploration_type(self._exploration):
-            self._decision = self._policy(self._state.select(*self._policy.in_keys))
-        step, self._state = self._transformed.step_and_maybe_reset(self._state.update(self._decision))
+            self._decision = self._policy(self.state.select(*self._policy.in_keys))
+            if self.pinned and self.has_gates:
+                self._compose_anew()
+        step, self.state = self._transformed.step_and_maybe_reset(self.state.update(self._decision))
         self.began = bool(step["next", "done"][0])
+
+    @property
+    def has_gates(self) -> bool:
+        """Whether the policy ends by composing primitives under gates, which can be pinned."""
+        return isinstance(self._policy, TensorDictSequential) and "gates" in self._policy[-1].in_keys
+
+    def _compose_anew(self) -> None:
+        """Compose the primitives again, under the gates that are pinned."""
+        for primitive, weight in self.pinned.items():
+            self._decision["gates"][..., primitive] = weight
+        self._decision = self._policy[-1](self._decision)
+
+    @property
+    def action(self) -> Tensor:
+        """The last action, ``(N, A)``."""
+        return self._decision["action"]
 
     @property
     def weights(self) -> Weights | None:

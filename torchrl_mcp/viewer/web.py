@@ -1,21 +1,41 @@
-"""MuJoCo Studio's web viewer with ghosts, arrows and the weights of primitives added."""
+"""MuJoCo Studio's web viewer with ghosts, arrows and a panel to steer by."""
 
 import time
+from dataclasses import dataclass
 
 import mujoco
 from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from mujoco.experimental.studio import launch_web, messages, plugin, sim, ux, viewer_app, viewer_protocol
-from PIL import ImageColor
 
-from torchrl_mcp.analysis.figures import colours
 from torchrl_mcp.envs.rendering import Shape
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.guard import HERE, guarded
+from torchrl_mcp.viewer.panel import Act, draw
 from torchrl_mcp.viewer.player import Player, Weights
+from torchrl_mcp.viewer.steering import TURN, Steering
 
 FURTHER = 1.4
 """Times as far as in a film is the camera: a notice of Studio covers the upper part of the page."""
+
+KEYS: dict[imgui.Key, Act] = {
+    imgui.Key.LeftArrow: lambda steering: steering.turn(TURN),
+    imgui.Key.RightArrow: lambda steering: steering.turn(-TURN),
+    imgui.Key.UpArrow: lambda steering: steering.play_next_alone(-1),
+    imgui.Key.DownArrow: lambda steering: steering.play_next_alone(1),
+}
+"""What the arrow keys do."""
+
+
+@dataclass(frozen=True)
+class Deed(messages.Event):
+    """What somebody does in the browser, for the thread of the simulation.
+
+    Args:
+        act: What to do.
+    """
+
+    act: Act
 
 
 class Stage(viewer_app.ViewerApp):
@@ -23,18 +43,19 @@ class Stage(viewer_app.ViewerApp):
 
     Attributes:
         shapes: What to draw beside the simulation.
-        weights: Of the primitives, or None to show no panel.
+        weights: Of the primitives, or None to show no bars.
 
-    The viewer's thread reads these, so that others replace them but do not change them.
+    The viewer's thread reads these and what is in hand, so that others replace them but do not change them.
 
     Args:
+        steering: What is in hand.
         distance: Of the camera from the character, in metres.
     """
 
-    def __init__(self, *, distance: float) -> None:
+    def __init__(self, steering: Steering, *, distance: float) -> None:
         self.shapes: list[Shape] = []
         self.weights: Weights | None = None
-        self._distance = distance
+        self._steering, self._distance = steering, distance
         super().__init__(viewer_app.ViewerAppConfig(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
@@ -45,6 +66,23 @@ class Stage(viewer_app.ViewerApp):
         following = ux.TRACKING_CAMERA_IDX if self.model.nbody > 1 else ux.FREE_CAMERA_IDX
         self.ux_state.camera_index = ux.set_camera(self.model, camera, following)
 
+    def handle_keyboard_events(self) -> None:
+        """Steer with the arrow keys; the others are Studio's."""
+        if not imgui.GetIO().WantCaptureKeyboard:
+            for key, act in KEYS.items():
+                if imgui.IsKeyPressed(key):
+                    self._do(act)
+        super().handle_keyboard_events()
+
+    def handle_mouse_events(self) -> None:
+        """Put the target where the ground is double-clicked, which Studio takes for the choice of a body to push."""
+        super().handle_mouse_events()
+        perturb = self.viewer.perturb
+        chosen = imgui.IsMouseDoubleClicked(imgui.MouseButton.Left) and not imgui.GetIO().WantCaptureMouse
+        if chosen and perturb.select == 0 and perturb.localpos.any():
+            place = perturb.localpos.copy()
+            self._do(lambda steering: steering.put(place))
+
     @messages.handler
     def on_update(self, _: messages.UpdateEvent) -> None:
         """Draw the shapes."""
@@ -52,20 +90,11 @@ class Stage(viewer_app.ViewerApp):
 
     @messages.handler
     def on_build_gui(self, _: messages.BuildGuiEvent) -> None:
-        """Show the weights as bars."""
-        if (weights := self.weights) is None:
-            return
-        imgui.SetNextWindowPos(imgui.Vec2(16, 48), int(imgui.Cond.FirstUseEver))
-        imgui.Begin(weights.title, flags=int(imgui.WindowFlags.AlwaysAutoResize))
-        for number, (value, shown) in enumerate(zip(weights.values, colours(len(weights.values)), strict=True)):
-            red, green, blue = ImageColor.getrgb(shown)[:3]
-            colour = imgui.Vec4(red / 255, green / 255, blue / 255, 1.0)
-            imgui.PushStyleColor(int(imgui.Col.PlotHistogram), colour)
-            imgui.ProgressBar(value, imgui.Vec2(160, 14), "")
-            imgui.PopStyleColor()
-            imgui.SameLine()
-            imgui.Text(str(number + 1))
-        imgui.End()
+        """Show the panel."""
+        draw(self._steering, self.weights, self._do)
+
+    def _do(self, act: Act) -> None:
+        self.viewer.send_to_sim(Deed(act))
 
 
 class Pace(plugin.SimPlugin):
@@ -85,6 +114,27 @@ class Pace(plugin.SimPlugin):
         self.paused, self.speed = snapshot.pause_state != sim.PauseState.UNPAUSED, snapshot.speed / 100
 
 
+class Hands(plugin.SimPlugin):
+    """What is done in the browser, done.
+
+    Args:
+        steering: Whom to steer.
+    """
+
+    def __init__(self, steering: Steering) -> None:
+        self._steering = steering
+
+    @messages.handler
+    def on_deed(self, deed: Deed) -> None:
+        """Do it."""
+        deed.act(self._steering)
+
+    @messages.handler
+    def on_reset(self, _: messages.ResetEvent) -> None:
+        """Begin a new episode."""
+        self._steering.reset()
+
+
 def as_geom(shape: Shape) -> mujoco.MjvGeom:
     """Return a shape as Studio draws it."""
     geom = mujoco.MjvGeom()
@@ -100,16 +150,18 @@ def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
         port: Of the page, 0 for the first free one from 8080.
         host: Address of the interface to listen on; others than this machine can watch, but not control.
     """
-    stage, pace = Stage(distance=FURTHER * DISTANCE * player.extent), Pace()
+    steering, pace = Steering(player), Pace()
+    stage = Stage(steering, distance=FURTHER * DISTANCE * player.extent)
     model = softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
-    with guarded(host), launch_web.launch(config, plugins=[stage, pace]) as viewer:
+    with guarded(host), launch_web.launch(config, plugins=[stage, pace, Hands(steering)]) as viewer:
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / pace.speed
             if not pace.paused:
-                player.step()
+                steering.step()
             mujoco.mj_copyData(data, model, player.data)
-            stage.shapes, stage.weights = player.shapes, player.weights
+            stage.shapes, stage.weights = player.shapes, player.weights or stage.weights
             viewer.sync(model, data)
+            steering.push(data.xfrc_applied)  # where a body is dragged
             time.sleep(max(0.0, due - time.perf_counter()))

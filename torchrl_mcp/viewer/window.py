@@ -1,23 +1,77 @@
-"""MuJoCo's own window, with ghosts, arrows and the weights of primitives."""
+"""MuJoCo's own window, with ghosts, arrows and the weights of primitives, and keys to steer by."""
 
 import os
 import sys
 import time
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
 
 import mujoco
 import mujoco.viewer
+import numpy as np
 
 from torchrl_mcp.envs.rendering import add_shapes
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.player import Player, Weights
+from torchrl_mcp.viewer.steering import TURN, Steering
 
 LENGTH = 24
 """Strokes of a weight of 1."""
 
+SLOWER = 0.5
+"""Factor of a key on the pace."""
+
+
+class Keyboard:
+    """Keys of the window, which a thread of its own reports.
+
+    Attributes:
+        paused: Whether to wait.
+        speed: Relative to real time.
+
+    Args:
+        steering: Whom to steer.
+    """
+
+    def __init__(self, steering: Steering) -> None:
+        self.paused, self.speed = False, 1.0
+        self._pressed: SimpleQueue[int] = SimpleQueue()
+        self._deeds: dict[int, Callable[[], None]] = {
+            263: lambda: steering.turn(TURN),  # GLFW's left arrow
+            262: lambda: steering.turn(-TURN),  # right
+            265: lambda: steering.play_next_alone(-1),  # up
+            264: lambda: steering.play_next_alone(1),  # down
+            259: steering.reset,  # backspace
+            257: steering.let_go,  # enter
+            ord(" "): self._pause,
+            ord("-"): lambda: self._pace(SLOWER),
+            ord("="): lambda: self._pace(1 / SLOWER),
+        }
+
+    def press(self, key: int) -> None:
+        """Note that a key was pressed, by GLFW's number."""
+        self._pressed.put(key)
+
+    def obey(self) -> None:
+        """Do what the keys say that were pressed since."""
+        while True:
+            try:
+                deed = self._deeds.get(self._pressed.get_nowait())
+            except Empty:
+                return
+            if deed is not None:
+                deed()
+
+    def _pause(self) -> None:
+        self.paused = not self.paused
+
+    def _pace(self, factor: float) -> None:
+        self.speed *= factor
+
 
 def play_in_window(player: Player) -> None:
-    """Play in real time until the window is closed.
+    """Play in real time, or as the keys say, until the window is closed.
 
     Args:
         player: What to show.
@@ -26,23 +80,46 @@ def play_in_window(player: Player) -> None:
         RuntimeError: If there is no display.
     """
     require_display()
-    model = softly_lit(player.env.simulation.model)
+    steering = Steering(player)
+    keyboard, model = Keyboard(steering), softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
-    with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
+    with mujoco.viewer.launch_passive(
+        model, data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
+    ) as viewer:
         camera = viewer.cam
         camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
         camera.distance, camera.azimuth, camera.elevation = DISTANCE * player.extent, AZIMUTH, ELEVATION
         while viewer.is_running():
-            due = time.perf_counter() + player.env.control_timestep
-            player.step()
+            due = time.perf_counter() + player.env.control_timestep / keyboard.speed
+            keyboard.obey()
+            if not keyboard.paused:
+                steering.step()
             with viewer.lock():
                 mujoco.mj_copyData(data, model, player.data)
                 viewer.user_scn.ngeom = 0
                 add_shapes(viewer.user_scn, player.shapes)
+                grasp(steering, model, data, viewer.perturb)
             if player.weights is not None:
                 viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *as_text(player.weights)))
             viewer.sync()
             time.sleep(max(0.0, due - time.perf_counter()))
+
+
+def grasp(steering: Steering, model: mujoco.MjModel, data: mujoco.MjData, hand: mujoco.MjvPerturb) -> None:
+    """Push the body that the mouse drags, and put the target where the ground was chosen.
+
+    Args:
+        steering: Whom to steer.
+        model: The scene.
+        data: Its state.
+        hand: What the mouse has chosen and where it drags it.
+    """
+    if hand.select == 0 and hand.localpos.any():
+        steering.put(hand.localpos)
+        hand.localpos[:] = 0  # once
+    data.xfrc_applied[:] = 0
+    mujoco.mjv_applyPerturbForce(model, data, hand)
+    steering.push(np.array(data.xfrc_applied))
 
 
 def require_display() -> None:

@@ -1,0 +1,125 @@
+"""Gates for tasks over the library's primitives: small files, exact, with a card that says where they come from."""
+
+import shutil
+import sys
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp.cli import evaluate, play, publish, publishing
+from torchrl_mcp.runs import builtin, experiment
+from torchrl_mcp.training import checkpoint
+
+PRETRAINED = builtin.builtin("mcp", "biped")
+
+
+def call(monkeypatch, command, *words):
+    monkeypatch.setattr(sys, "argv", [command.PROGRAM, *map(str, words)])
+    command.main()
+
+
+def refused(monkeypatch, command, *words):
+    with pytest.raises(SystemExit) as stopped:
+        call(monkeypatch, command, *words)
+    return str(stopped.value)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The first steps of a gate for heading over the library's primitives."""
+    folder = tmp_path_factory.mktemp("secret") / "run"
+    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
+    settings += ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return experiment.train(compose("train", [*settings, "task.evaluation.max_episode_steps=30"]))
+
+
+@pytest.fixture(scope="module")
+def networks(run, tmp_path_factory):
+    """A folder of the library's networks with a gate for heading among them."""
+    folder = tmp_path_factory.mktemp("networks")
+    shutil.copy(PRETRAINED, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(builtin, "FOLDER", folder)
+        patch.setattr(publishing, "FOLDER", folder)
+        gate = folder / "mcp-biped-heading.torchrl"
+        call(patch, publish, run, "--output", gate, "--episodes", 2, "--limits", "It has hardly learnt anything.")
+    return folder
+
+
+@pytest.fixture
+def library(networks, monkeypatch):
+    """The same, as the folder from which commands take what comes with the library."""
+    monkeypatch.setattr(builtin, "FOLDER", networks)
+    return networks
+
+
+def act(path):
+    """Deterministic actions of a policy in states of its task."""
+    _, agent, env = experiment.restore(path, num_envs=3, seed=4)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return agent.actor.policy(env.reset())["action"]
+
+
+def test_a_gate_acts_as_its_run_does_without_holding_the_primitives(run, library):
+    gate = library / "mcp-biped-heading.torchrl"
+    torch.testing.assert_close(act(gate), act(run), atol=0.02, rtol=0)
+    with ZipFile(gate) as archive:
+        assert not [name for name in archive.namelist() if "primitives" in name or "observation_normaliser" in name]
+    _, agent, _ = experiment.restore(gate, num_envs=1, seed=0)
+    _, original, _ = experiment.restore(PRETRAINED, num_envs=1, seed=0)
+    for name, parameter in original.parts["primitives"].state_dict().items():
+        assert torch.equal(agent.parts["primitives"].state_dict()[name], parameter)
+
+
+def test_a_gate_has_a_name_that_commands_take(library, monkeypatch, capsys):
+    path = builtin.locate("builtin:biped-heading")
+    assert path == builtin.builtin("mcp", "biped", "heading") == library / "mcp-biped-heading.torchrl"
+    call(monkeypatch, evaluate, "builtin:biped-heading", "--episodes", 2)
+    assert "builtin:biped-heading: 2 episodes" in capsys.readouterr().out
+    said = refused(monkeypatch, play, "builtin:biped-flying")
+    assert "no builtin:biped-flying comes with the library: give one of builtin:biped, builtin:biped-heading" in said
+
+
+def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, library):
+    card = (library / "mcp-biped-heading.md").read_text()
+    assert "torchrl-mcp-play builtin:biped-heading --viewer web" in card
+    assert "512 steps, preset" in card
+    assert "- It has hardly learnt anything." in card
+    assert "0.976 ± 0.002" in card  # the paper's
+    numbers = experiment.evaluation(library / "mcp-biped-heading.torchrl", episodes=2, seed=12345)
+    assert f"{numbers['deterministic']['normalised_return']:.3f}" in card
+    assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
+
+
+def test_over_other_primitives_than_its_own_a_gate_is_neither_played_nor_published(run, library, monkeypatch, tmp_path):
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+    other = Path(shutil.copy(PRETRAINED, tmp_path))
+    _, agent, _ = experiment.restore(other, num_envs=1, seed=0)
+    cfg = checkpoint.saved_config(other)
+    next(agent.parts["primitives"].parameters()).data += 0.5
+    experiment.publish(agent.parts, cfg, other)
+    with pytest.raises(ValueError, match=r"needs other primitives than mcp-biped\.torchrl"):
+        experiment.restore(library / "mcp-biped-heading.torchrl", num_envs=1, seed=0)
+    said = refused(monkeypatch, publish, run, "--output", tmp_path / "again.torchrl")
+    assert "trained over other primitives than mcp-biped.torchrl" in said
+
+
+def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatch, tmp_path):
+    assert "no run folder" in refused(monkeypatch, publish, tmp_path / "nowhere", "--output", tmp_path / "a.torchrl")
+    assert "end it with .torchrl" in refused(monkeypatch, publish, run, "--output", tmp_path / "a.zip")
+
+
+@pytest.mark.parametrize(
+    "gate", sorted(filter(builtin.has_task, PRETRAINED.parent.glob("*.torchrl"))), ids=lambda p: p.stem
+)
+def test_every_gate_that_comes_with_the_library_has_a_card_and_returns_more_than_standing_still(gate):
+    page = (gate.parents[2] / "docs" / "networks.md").read_text()
+    assert gate.with_suffix(".md").is_file()
+    assert f"networks/{gate.stem}.md" in page
+    numbers = experiment.evaluate_run(gate, episodes=8, seed=0, max_episode_steps=300)["deterministic"]
+    assert numbers["reach"]["place"] > 0.2

@@ -1,0 +1,176 @@
+"""Steering without a window: goals, pushes, pinned gates and new episodes."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.experiment import restore
+from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.viewer.steering import Steering
+
+IDLE = TensorDictModule(lambda goal: torch.zeros(len(goal), 17), in_keys=["goal"], out_keys=["action"])
+
+
+def idle(task, **settings):
+    return Steering(Player(IDLE, task("biped", 1, seed=0, num_threads=1, **settings)))
+
+
+def target(steering):
+    """Where the arrow of heading points, in radians."""
+    [(tail, tip)] = steering.player.env.arrows(0)
+    return math.atan2(*(tip - tail)[1::-1])
+
+
+@pytest.fixture
+def walker():
+    """The built-in biped, which imitates motions under eight gates."""
+    _, agent, env = restore(builtin("mcp", "biped"), num_envs=1, seed=0)
+    return Steering(Player(agent.actor.policy, env))
+
+
+def test_a_direction_in_hand_is_the_goal_wanders_no_more_and_outlasts_an_episode():
+    steering = idle(Heading, max_turn=0.15)
+    steering.turn(math.pi / 2)
+    for _ in range(5):
+        steering.step()
+        assert target(steering) == pytest.approx(math.pi / 2)
+    steering.reset()
+    steering.step()
+    env = steering.player.env
+    seen = env.heading()[0] + math.atan2(*steering.player.state["goal"][0].flip(0).tolist())
+    assert float(seen) == pytest.approx(math.pi / 2, abs=1e-6)
+
+
+def test_turns_add_up_and_stay_between_plus_and_minus_pi():
+    steering = idle(Heading)
+    for _ in range(3):
+        steering.turn(math.pi / 2)
+    assert steering.target_direction == pytest.approx(-math.pi / 2)
+
+
+def test_let_go_the_direction_wanders_again():
+    steering = idle(Heading, max_turn=0.15)
+    steering.aim(1.0)
+    steering.step()
+    steering.let_go()
+    steering.step()
+    assert 0 < abs(target(steering) - 1.0) <= 0.15
+
+
+@pytest.mark.parametrize("task", [Carry, Dribble])
+def test_a_target_is_where_it_is_put(task):
+    steering = idle(task)
+    steering.put((1.5, -2.5, 0.0))
+    steering.step()
+    assert steering.player.data.body("target").xpos[:2].tolist() == [1.5, -2.5]
+    goal, env = steering.player.state["goal"][0], steering.player.env
+    away = goal[env.goal_layout["target.position"]][:2].numpy()  # in the frame of the character
+    root, angle = env.simulation.data(0).xpos[1, :2], float(env.heading()[0])
+    turned = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    np.testing.assert_allclose(root + turned @ away, [1.5, -2.5], atol=1e-5)
+
+
+def test_of_a_task_without_it_nothing_is_turned_or_put():
+    steering, ball = idle(Heading), idle(Dribble)
+    assert (steering.has_direction, steering.has_place) == (True, False)
+    assert (ball.has_direction, ball.has_place) == (False, True)
+    steering.put((1.0, 1.0))
+    ball.turn(1.0)
+    assert steering.place is ball.direction is None
+
+
+def momentum(player):
+    """Of the whole character, in kg m/s: what a finite difference of its centre of mass says."""
+    data, model = player.data, player.env.simulation.model
+    mujoco.mj_subtreeVel(model, data)
+    return model.body_subtreemass[1] * data.subtree_linvel[1]
+
+
+@pytest.mark.parametrize("body", ["torso", "left_ankle"])
+def test_a_push_changes_momentum_by_force_times_time(body):
+    steering = idle(Heading)
+    env = steering.player.env
+    state = env.get_state()
+    state["qpos"][:, 2] += 5.0  # in the air, where nothing else but its weight acts on it
+    env.reset(state.select("qpos", "qvel"), set_state=True)
+    forces, force = np.zeros((env.simulation.model.nbody, 6)), np.array([30.0, -20.0, 10.0])
+    forces[env.simulation.model.body(body).id, :3] = force
+    before = momentum(steering.player)
+    steering.push(forces)
+    for _ in range(3):
+        steering.step()
+    weight = env.simulation.model.body_subtreemass[1] * env.simulation.model.opt.gravity
+    np.testing.assert_allclose(momentum(steering.player) - before, (force + weight) * 0.1, rtol=0.01)
+    before = momentum(steering.player)
+    steering.push(0 * forces)
+    steering.step()
+    np.testing.assert_allclose(momentum(steering.player) - before, weight / 30, rtol=0.01, atol=0.01)
+
+
+def test_a_primitive_that_plays_alone_acts_as_it_does_by_itself(walker):
+    _, agent, _ = restore(builtin("mcp", "biped"), num_envs=1, seed=0)
+    walker.step()
+    for primitive in (2, 7):
+        walker.play_alone(primitive)
+        state = walker.player.state.clone()
+        walker.step()
+        parts = agent.parts
+        with torch.no_grad():
+            loc, _ = parts["primitives"](parts["observation_normaliser"](state["observation"]))
+        torch.testing.assert_close(walker.player.action, loc[:, primitive], atol=1e-5, rtol=0)
+
+
+def test_one_pinned_gate_leaves_the_others_to_the_gate_and_comes_back_when_released(walker):
+    _, agent, _ = restore(builtin("mcp", "biped"), num_envs=1, seed=0)
+
+    def gates(state):
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            return agent.actor.policy(state)["gates"][0].tolist()
+
+    walker.step()
+    walker.pin(3, 0.25)
+    state = walker.player.state.clone()
+    walker.step()
+    expected = gates(state)
+    assert walker.player.weights.values == pytest.approx([*expected[:3], 0.25, *expected[4:]])
+    walker.release(3)
+    state = walker.player.state.clone()
+    walker.step()
+    assert walker.player.weights.values == pytest.approx(gates(state))
+
+
+def test_keys_let_one_primitive_after_another_act_alone_and_then_the_gate(walker):
+    walker.step()
+    shown = []
+    for _ in range(9):
+        walker.play_next_alone(1)
+        shown.append([number for number, weight in walker.player.pinned.items() if weight])
+    assert shown == [[0], [1], [2], [3], [4], [5], [6], [7], []]
+    walker.play_next_alone(-1)
+    assert walker.player.pinned[7] == 1.0
+
+
+def test_a_policy_without_gates_has_none_to_pin():
+    steering = idle(Heading)
+    steering.step()
+    steering.play_alone(0)
+    steering.play_next_alone(1)
+    steering.pin(0, 0.5)
+    steering.step()
+    assert steering.player.weights is None
+
+
+def test_a_reset_begins_a_new_episode():
+    steering = idle(Heading)
+    for _ in range(3):
+        steering.step()
+    steering.reset()
+    assert steering.player.began
+    assert steering.player.data.time == 0.0

@@ -1,0 +1,52 @@
+"""``torchrl-mcp-publish``: a trained policy as a small file, with a model card."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
+
+PROGRAM = "torchrl-mcp-publish"
+
+EXAMPLES = f"""\
+The file holds the policy alone, in bfloat16, without what training froze of the networks that come with the library.
+All commands take it as a CHECKPOINT. The card beside it says how it was trained, on what, and what it returns.
+
+examples:
+  {PROGRAM} runs/heading --output heading.torchrl --limits "falls on turns of more than 90 degrees"
+"""
+
+
+def main() -> None:
+    """Write the file and its card."""
+    arguments = parser().parse_args()
+    try:
+        if arguments.output.suffix != ".torchrl":
+            raise ValueError(f"{arguments.output} is not the name of a checkpoint: end it with .torchrl")
+        if not arguments.run.is_dir():
+            raise ValueError(f"there is no run folder {arguments.run}")
+        announce(PROGRAM)
+        from torchrl_mcp.cli.publishing import publish
+        from torchrl_mcp.runs.trust import trusting
+
+        with trusting(arguments.trust):
+            publish(arguments.run, arguments.output, episodes=arguments.episodes, limits=arguments.limits)
+    except ValueError as error:
+        sys.exit(f"{PROGRAM}: {error}")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Write a trained policy as a small file, with a model card beside it.", EXAMPLES)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder, of which the newest checkpoint counts")
+    add_trust(parser)
+    parser.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help="the file, .torchrl; the card ends in .md"
+    )
+    parser.add_argument("--limits", action="append", default=[], help="a sentence of the card's limits; repeatable")
+    parser.add_argument("--episodes", type=int, default=128, help="of the evaluation in the card (default 128)")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
