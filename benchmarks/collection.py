@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 from report import about, table, write
 
-from torchrl_mcp.analysis.curves import read_metrics
+from torchrl_mcp.analysis import read_metrics
 
 RESULTS = Path(__file__).resolve().parent / "results" / "collection.csv"
 CORES = os.cpu_count() or 1

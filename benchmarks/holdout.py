@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 from report import write
 
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
 from torchrl_mcp.report.results import Run, read_run

@@ -18,7 +18,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 from report import about, write
 
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import FOLDER

@@ -1,6 +1,6 @@
 """The paper's figures, from run folders and policies. Nothing here touches matplotlib's global state."""
 
-from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves, read_metrics, write_curves
+from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves, write_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import (
     Trajectories,
@@ -9,6 +9,7 @@ from torchrl_mcp.analysis.holdout import (
     play_directions,
     save_trajectories,
 )
+from torchrl_mcp.training.run_folder import read_metrics
 
 __all__ = [
     "Curve",

@@ -15,11 +15,9 @@ from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
-from torchrl_mcp.training.run_folder import METRICS
+from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
 
 Array = NDArray[np.float64]
-
-QUANTITY = "episode/normalised_return"
 
 
 @dataclass(frozen=True)
@@ -43,21 +41,8 @@ class Curve:
     seeds: int
 
 
-def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's ``metrics.csv``; blank is NaN, and a row half written is left out."""
-    path = run / METRICS
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [
-            {name: float(value or "nan") for name, value in row.items()}
-            for row in csv.DictReader(file)
-            if None not in row.values()
-        ]
-
-
 def learning_curves(
-    groups: Mapping[str, Sequence[Path]], *, quantity: str = QUANTITY, num_bins: int = 50
+    groups: Mapping[str, Sequence[Path]], *, quantity: str = NORMALISED_RETURN, num_bins: int = 50
 ) -> list[Curve]:
     """Return one curve per group on a common grid of steps, for what every seed of the group has reached.
 

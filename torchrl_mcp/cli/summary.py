@@ -7,9 +7,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
 from torchrl_mcp.report.paper import TABLE_2
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics
 
 
 def summary(folder: Path) -> str:
@@ -31,9 +30,7 @@ def final_return(folder: Path) -> float | None:
 
 def last_return(folder: Path) -> float | None:
     """Return the normalised return of the last iteration of training in which an episode ended, None if none has."""
-    if not (folder / METRICS).is_file():
-        return None
-    returns = [row.get(QUANTITY, math.nan) for row in read_metrics(folder)]
+    returns = [row.get(NORMALISED_RETURN, math.nan) for row in read_metrics(folder)]
     return next((value for value in reversed(returns) if math.isfinite(value)), None)
 
 

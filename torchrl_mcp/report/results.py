@@ -12,10 +12,17 @@ from typing import Any, cast
 
 from omegaconf import OmegaConf
 
-from torchrl_mcp.analysis.curves import QUANTITY, read_metrics
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.trust import read_config
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, PROVENANCE, read_json
+from torchrl_mcp.training.run_folder import (
+    CONFIG,
+    EVALUATION,
+    METRICS,
+    NORMALISED_RETURN,
+    PROVENANCE,
+    read_json,
+    read_metrics,
+)
 
 MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
@@ -211,7 +218,7 @@ def _progress(folder: Path) -> dict[str, Any]:
     return {
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],
-        "has_episodes": any(math.isfinite(row[QUANTITY]) for row in rows),
+        "has_episodes": any(math.isfinite(row[NORMALISED_RETURN]) for row in rows),
     }
 
 

@@ -23,7 +23,7 @@ from rich.text import Text
 from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.runs.trust import read_config
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, read_json, write_json
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, NORMALISED_RETURN, read_json, write_json
 
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
@@ -123,7 +123,7 @@ def status(run: Path, total: int | None = None) -> Status:
     total = _plan(run)[0] if total is None else total
     last = _last_row(run / METRICS)
     frames = int(last.get("frames", 0))
-    speed, score = last.get("time/steps_per_second", 0.0), last.get("episode/normalised_return")
+    speed, score = last.get("time/steps_per_second", 0.0), last.get(NORMALISED_RETURN)
     if (run / EVALUATION).exists():
         score = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
         return Status(run, "done", frames, total, speed, score)

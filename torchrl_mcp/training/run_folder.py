@@ -1,5 +1,6 @@
 """The files of a run folder: their names, and how they are written."""
 
+import csv
 import json
 import os
 import shutil
@@ -15,6 +16,9 @@ CONFIG = "config.yaml"
 
 METRICS = "metrics.csv"
 """A row of metrics per iteration."""
+
+NORMALISED_RETURN = "episode/normalised_return"
+"""The column of metrics with the mean of the episodes that ended, blank if none did."""
 
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""
@@ -81,6 +85,19 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError("it holds no object")
     return content
+
+
+def read_metrics(run: Path) -> list[dict[str, float]]:
+    """Return the rows of a run's ``metrics.csv``; blank is NaN, and a row half written is left out."""
+    path = run / METRICS
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [
+            {name: float(value or "nan") for name, value in row.items()}
+            for row in csv.DictReader(file)
+            if None not in row.values()
+        ]
 
 
 def remove_leftovers(run: Path) -> None:

@@ -26,6 +26,7 @@ from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.episodes import EpisodeStatistics
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Progress, Stopwatch
+from torchrl_mcp.training.run_folder import NORMALISED_RETURN
 from torchrl_mcp.training.threads import side_by_side
 from torchrl_mcp.training.transfer import FrozenParts
 
@@ -179,7 +180,7 @@ class Trainer:
                     self._update_normalisers(batch)
                 self.frozen.verify()
                 self._advance(metrics, time.perf_counter() - start)
-                bar.advance(batch.numel(), metrics["episode/normalised_return"])
+                bar.advance(batch.numel(), metrics[NORMALISED_RETURN])
 
     def _behaviour(self) -> TensorDictModuleBase:
         """Return the policy as it collects: what it writes is what the loss reads, and no more."""
@@ -270,7 +271,7 @@ class Trainer:
         return {
             "episode/count": len(returns),
             "episode/return": returns.mean().item(),
-            "episode/normalised_return": self.source.env.normalised_return(returns).mean().item(),
+            NORMALISED_RETURN: self.source.env.normalised_return(returns).mean().item(),
             "episode/length": lengths.mean().item(),
             **self.source.metrics(),
             "reward": batch["next", "reward"].mean().item(),

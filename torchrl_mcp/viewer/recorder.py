@@ -16,10 +16,11 @@ from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger
 
-from torchrl_mcp.analysis.curves import QUANTITY, draw_curves, learning_curves, read_metrics
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves
 from torchrl_mcp.analysis.figures import bare, colours, new_figure
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
 from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player, Weights
 
@@ -102,7 +103,7 @@ class Recorder:
         if figure := self._weights(policy):
             figure.savefig(gates, dpi=100)
             yield "gates", gates
-        if any(math.isfinite(row[QUANTITY]) for row in read_metrics(self._folder)):
+        if any(math.isfinite(row[NORMALISED_RETURN]) for row in read_metrics(self._folder)):
             draw_curves(learning_curves({"this run": [self._folder]})).savefig(curve, dpi=100)
             yield "curve", curve
 
