@@ -2,6 +2,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_module
 
 import torchrl_mcp.conf
@@ -18,6 +19,18 @@ CHOICES = [f"{file.parent.name}={file.stem}" for file in sorted(CONF.glob("*/*.y
 def test_every_choice_of_every_group_composes(choice):
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         compose("train", [choice])
+
+
+@pytest.mark.parametrize(
+    ("task", "practice", "mixture"), [("holdout", "emphasis", 0), ("holdout", "shaping", 0), ("dribble", "shaping", 2)]
+)
+def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, practice, mixture):
+    arguments = [f"task={task}", f"practice={practice}", "stage=transfer", "--cfg", "job", "--resolve"]
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
+    main()
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert len(printed["practice"]["mixture"]) == mixture
+    assert printed["run_dir"] == f"runs/{task}-{printed['character']['name']}/transfer/mcp/practice-{practice}/seed0"
 
 
 @pytest.mark.parametrize(

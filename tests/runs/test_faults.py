@@ -11,10 +11,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_mcp.runs import experiment, lock
 from torchrl_mcp.runs.status import status
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
 
 SETTINGS = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "training.total_frames=640"]
 EVERY = ["checkpoint_interval=1", "keep_checkpoints=9"]
@@ -97,8 +98,19 @@ def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_o
         assert torch.equal(parts[name], value), name
 
 
+def test_tensorboard_shows_every_step_once_after_a_resume(tmp_path):
+    folder = experiment.train(configure(tmp_path / "run", "logger=tensorboard"))
+    for path in run_folder.find_all(folder)[:2]:
+        path.unlink()
+    experiment.resume(folder)
+    shown = EventAccumulator(str(folder / "tensorboard")).Reload().Scalars("reward")
+    assert [(event.step, event.value) for event in shown] == [
+        (int(row["frames"]), pytest.approx(float(row["reward"]))) for row in rows(folder)
+    ]
+
+
 def test_where_every_checkpoint_is_damaged_nothing_is_touched(killed):
-    for path in checkpoint.find_all(killed):
+    for path in run_folder.find_all(killed):
         damage(path)
     before = contents(killed)
     with pytest.raises(ValueError, match="damaged"):

@@ -12,8 +12,9 @@ from torchrl_mcp.runs.status import look, overview, status, table, write_manifes
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
 
 
-def make_run(folder, *, frames=0, total=1000, log=True, evaluation=None, episodes=None):
-    folder.mkdir(parents=True)
+def make_run(folder, *, frames=0, total=1000, log=True, evaluation=None, episodes=None, saved=0):
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / f"checkpoint-{saved:012d}.torchrl").touch()
     settings = "" if episodes is None else f"evaluation: {{episodes: {episodes}}}\n"
     (folder / "config.yaml").write_text(f"training: {{total_frames: {total}}}\n{settings}")
     if frames:
@@ -55,9 +56,13 @@ def test_the_return_is_that_of_the_evaluation_once_there_is_one(runs):
 
 
 def test_a_run_is_done_after_its_steps_unless_an_evaluation_is_to_follow(tmp_path):
-    assert status(make_run(tmp_path / "old", frames=1000, log=False)).state == "done"
-    assert status(make_run(tmp_path / "none", frames=1000, episodes=0)).state == "done"
-    assert status(make_run(tmp_path / "died", frames=1000, episodes=128)).state == "stopped"
+    assert status(make_run(tmp_path / "old", frames=1000, saved=1000, log=False)).state == "done"
+    assert status(make_run(tmp_path / "none", frames=1000, saved=1000, episodes=0)).state == "done"
+    assert status(make_run(tmp_path / "died", frames=1000, saved=1000, episodes=128)).state == "stopped"
+
+
+def test_a_run_that_was_killed_between_its_last_row_and_its_last_checkpoint_is_not_done(tmp_path):
+    assert status(make_run(tmp_path / "killed", frames=1000, saved=900, episodes=0)).state == "stopped"
 
 
 def test_a_row_that_is_being_written_is_not_read(runs):

@@ -19,7 +19,6 @@ from torchrl import torchrl_logger
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.checkpoint import (
     find,
-    find_all,
     load,
     load_parts,
     rotation,
@@ -27,6 +26,7 @@ from torchrl_mcp.training.checkpoint import (
     save,
     saved_config,
 )
+from torchrl_mcp.training.run_folder import find_all
 
 CONFIG = {"method": {"name": "mcp"}, "seed": 3}
 PREFIX = "components/0000-part-gating"

@@ -7,6 +7,7 @@ import sys
 import time
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 import torch
@@ -46,6 +47,12 @@ def rows(folder):
 
 def numbers(row):
     return {key: value for key, value in row.items() if not key.startswith(("seconds", "time/"))}
+
+
+def living(session):
+    """The processes of a session, as Linux lists them."""
+    stats = [path.read_text().rpartition(") ")[2].split() for path in Path("/proc").glob("[0-9]*/stat")]
+    return [fields for fields in stats if fields[0] != "Z" and int(fields[3]) == session]
 
 
 def restored(folder):
@@ -130,6 +137,23 @@ def test_a_killed_worker_ends_the_run_within_seconds_by_name_and_leaves_none(tmp
     assert time.monotonic() - killed[0] < 15
     assert len(workers) == 2
     assert not set(workers) & set(multiprocessing.active_children())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not find_spec("ray") or sys.platform != "linux", reason="needs Ray, and Linux's /proc")
+def test_everything_that_ray_started_is_gone_half_a_minute_after_the_run_was_killed(tmp_path):
+    arguments = [*SMOKE, f"run_dir={tmp_path}", "collector=ray", "training.total_frames=1000000"]
+    run = subprocess.Popen([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], start_new_session=True)
+    while not (tmp_path / "metrics.csv").exists():
+        assert run.poll() is None
+        time.sleep(0.5)
+    assert len(living(run.pid)) > 5  # the run, two workers, and what serves them
+    run.kill()
+    run.wait()
+    deadline = time.monotonic() + 30
+    while living(run.pid) and time.monotonic() < deadline:
+        time.sleep(0.5)
+    assert not living(run.pid)
 
 
 def test_a_worker_follows_the_process_that_started_it(monkeypatch):

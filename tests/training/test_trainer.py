@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_module
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.training import checkpoint, trainer
+from torchrl_mcp.training import checkpoint, run_folder, trainer
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.threads import threads
 from torchrl_mcp.training.trainer import Trainer
@@ -106,7 +106,7 @@ def test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit
         cut = tmp_path / str(frames)
         shutil.copytree(whole, cut)
         for path in sorted((cut / checkpoint.FOLDER).iterdir()):
-            if checkpoint.frames(path) > frames:
+            if run_folder.frames(path) > frames:
                 path.unlink()
         experiment.resume(cut)
         assert rows(cut) == rows(whole)

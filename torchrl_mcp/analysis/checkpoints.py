@@ -18,7 +18,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.methods.actor import PRIMITIVES, Explorer
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
 
 UNTRAINED = 10
 """Networks before training, whose mean numbers are put beside those of trained ones."""
@@ -141,7 +141,7 @@ def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
         Trajectories by a name that says when and where; of a run that is not over, that it is not.
     """
     cfg, panels = experiment.policy_config(path), {}
-    over = path.is_file() or checkpoint.frames(checkpoint.find(path)) >= cfg.training.total_frames
+    over = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):
         low, high = cfg.task.directions[shown]

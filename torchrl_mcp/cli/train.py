@@ -65,6 +65,7 @@ def parser() -> argparse.ArgumentParser:
         "-cd", "--config-dir", metavar="FOLDER", help="where settings of your own are, whose modules may be here"
     )
     parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration, do nothing else")
+    parser.add_argument("--resolve", action="store_true", help="with --cfg: print values in place of references")
     parser.add_argument("-sc", "--shell-completion", action="store_true", help="install with -sc install=bash")
     add_trust(parser)
     parser.add_argument("--hydra-help", action="store_true", help="what else Hydra has")

@@ -24,7 +24,8 @@ from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import provenance
 from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
 from torchrl_mcp.runs.trust import read_config, trusting
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
+from torchrl_mcp.training.metrics import begin_after
 from torchrl_mcp.training.precision import choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, remove_leftovers, replacing, write_json
 from torchrl_mcp.training.trainer import Trainer
@@ -109,7 +110,7 @@ def is_complete(folder: Path) -> bool:
         ValueError: If the folder holds no run.
     """
     cfg = run_config(folder)
-    trained = checkpoint.frames(checkpoint.find(folder)) >= cfg.training.total_frames
+    trained = run_folder.frames(checkpoint.find(folder)) >= cfg.training.total_frames
     return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
 
 
@@ -271,10 +272,10 @@ def _resume(folder: Path) -> Path:
 
 def _restored(cfg: DictConfig, folder: Path) -> Trainer:
     """Return the trainer of a run at its newest checkpoint that is not damaged; say so if that is not the newest."""
-    saved = checkpoint.find_all(folder) or [checkpoint.find(folder)]
+    saved = run_folder.find_all(folder) or [checkpoint.find(folder)]
     path = next((path for path in saved if checkpoint.is_intact(path)), saved[0])
     _require_same_run(cfg, path)
-    if checkpoint.frames(path):
+    if run_folder.frames(path):
         trainer = _trainer(cfg, folder)
         trainer.restore(path)
     else:  # the environments have not been reset yet, so there is no state of theirs to return to
@@ -329,6 +330,8 @@ def _precision_kept(cfg: DictConfig, folder: Path) -> str:
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> None:
     """Train to the end and evaluate what came of it."""
     loggers = build.make_loggers(cfg)
+    for logger in loggers:
+        begin_after(logger, trainer.progress.frames)
     trainer.metrics_writer.loggers = [*loggers, *build.make_recorders(cfg, trainer.actor, folder, loggers)]
     trainer.run()
     if not (folder / CONFIG).is_file():

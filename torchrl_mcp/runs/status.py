@@ -23,6 +23,7 @@ from rich.text import Text
 from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.runs.trust import read_config
+from torchrl_mcp.training import run_folder
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, NORMALISED_RETURN, read_json, write_json
 
 MANIFEST = "benchmark-{}.json"
@@ -44,7 +45,8 @@ class Status:
 
     Attributes:
         folder: Its run folder.
-        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), ``done``, or ``damaged`` (cannot be read).
+        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), ``done`` (with its last checkpoint and its
+            evaluation, if there is one), or ``damaged`` (cannot be read).
         frames: Environment steps so far.
         total: Environment steps in all.
         speed: Environment steps per second, of the last iteration.
@@ -129,7 +131,7 @@ def status(run: Path, total: int | None = None) -> Status:
         return Status(run, "done", frames, total, speed, score)
     if lock.holder(run):
         return Status(run, "running", frames, total, speed, score)
-    if frames >= total and not _plan(run)[1]:
+    if _is_saved(run, total) and not _plan(run)[1]:
         return Status(run, "done", frames, total, speed, score)
     begun = (run / CONFIG).exists() or (run / LOG).exists()
     return Status(run, "stopped" if begun else "waiting", frames, total, speed, score)
@@ -189,6 +191,11 @@ def _plan(run: Path) -> tuple[int, int]:
     """Return the environment steps of a run that has begun, and the episodes of the evaluation after them."""
     config = read_config(run / CONFIG)
     return int(config["training"]["total_frames"]), int(config.get("evaluation", {}).get("episodes", 0))
+
+
+def _is_saved(run: Path, total: int) -> bool:
+    """Tell whether a run has the checkpoint of its end, which is written after the last row."""
+    return any(run_folder.frames(path) >= total for path in run_folder.find_all(run))
 
 
 def _last_row(path: Path) -> dict[str, float]:

@@ -17,12 +17,9 @@ from torch import nn
 from torchrl import torchrl_logger
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-from torchrl_mcp.training.run_folder import CHECKPOINTS, replacing
+from torchrl_mcp.training.run_folder import CHECKPOINT, CHECKPOINTS, find_all, replacing
 
 FOLDER = CHECKPOINTS
-
-NAME = "checkpoint-{:012d}.torchrl"
-"""Of a checkpoint file, by environment steps, as TorchRL's rotation has it."""
 
 DAMAGED = ".damaged"
 """At the end of the name of a checkpoint that could not be restored."""
@@ -95,7 +92,7 @@ def rotation(run: Path, keep_last: int) -> CheckpointRotation:
 
 def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
     """Write ``checkpoint`` among ``checkpoints``. It is on the disk before older ones are removed."""
-    with replacing(checkpoints.directory / NAME.format(step)) as partial:
+    with replacing(checkpoints.directory / CHECKPOINT.format(step)) as partial:
         checkpoint.save(partial, metadata={"config": config})
     checkpoints.prune()
 
@@ -113,12 +110,6 @@ def find(path: Path) -> Path:
     raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
 
 
-def find_all(run: Path) -> list[Path]:
-    """Return the checkpoint files of a run folder that training wrote, the newest first."""
-    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
-    return sorted((path for path in (run / FOLDER).glob("checkpoint-*.torchrl") if frames(path) >= 0), reverse=True)
-
-
 def is_intact(path: Path) -> bool:
     """Tell whether the file ``path`` is a whole checkpoint, with a manifest and all checksums right."""
     try:
@@ -132,15 +123,6 @@ def is_intact(path: Path) -> bool:
 def set_aside(path: Path) -> None:
     """Give a damaged checkpoint another name, by which nobody takes it for one of the run's."""
     path.replace(path.with_name(f"{path.name}{DAMAGED}"))
-
-
-def frames(path: Path) -> int:
-    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written.
-
-    That of another file, such as a copy ``checkpoint-best.torchrl``, is -1.
-    """
-    step = path.stem.removeprefix("checkpoint-")
-    return int(step) if step.isdecimal() else -1
 
 
 def saved_config(path: Path) -> Mapping[str, Any]:

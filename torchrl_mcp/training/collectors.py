@@ -1,6 +1,7 @@
 """Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ from torchrl.collectors import Collector
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.training import ray_agents
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads
 from torchrl_mcp.training.workers import attend, end, end_with_parent, new_workers
@@ -202,6 +204,9 @@ class RemoteSource:
         seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
         self._starts += 1
         random = GlobalRNGState().state_dict()
+        self._watched = ExitStack()
+        if self._backend["backend"] == "ray":
+            self._watched.enter_context(ray_agents.watched())
         with new_workers() as self._workers:
             self._collector = Collector(
                 [partial(self._make_env, seed=int(seed)) for seed in seeds],
@@ -237,6 +242,7 @@ class RemoteSource:
             self._collector.shutdown(timeout=PATIENCE)
         finally:
             end(self._workers)
+            self._watched.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Return how often the workers have been started."""

@@ -5,11 +5,25 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torchrl_mcp.training.run_folder import METRICS, flush, replacing
 
 CSV_LOGGER = "csv/scalars"
 """Where in a run folder TorchRL's csv logger has its files, of lines ``step,value``."""
+
+
+def begin_after(logger: Logger, frames: int) -> None:
+    """Make TensorBoard drop what was logged after environment step ``frames``, by a run that was killed since.
+
+    Other loggers are left alone: the csv logger's files are rewound with ``metrics.csv``, and W&B and MLflow take a
+    resumed run for a new one.
+    """
+    if isinstance(logger, TensorboardLogger):
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+        start = Event(session_log=SessionLog(status=SessionLog.START))
+        logger.experiment.file_writer.add_event(start, frames + 1)
 
 
 class MetricsWriter:
@@ -79,9 +93,10 @@ class MetricsWriter:
     def _rewind_csv_logger(self, frames: int) -> None:
         """Drop what TorchRL's csv logger, which appends to its files, has written after environment step ``frames``."""
         for path in (self.path.parent / CSV_LOGGER).rglob("*.csv"):
-            steps = [line for line in path.read_text().splitlines() if line.partition(",")[0].isdecimal()]
+            lines = path.read_text(errors="replace").splitlines(keepends=True)
+            pairs = [line for line in lines if line.partition(",")[0].isdecimal() and line.endswith("\n")]
             with replacing(path) as partial:
-                partial.write_text("".join(f"{line}\n" for line in steps if int(line.partition(",")[0]) <= frames))
+                partial.write_text("".join(line for line in pairs if int(line.partition(",")[0]) <= frames))
 
     def _rows(self) -> list[dict[str, str]]:
         """Return all whole rows that number their iteration."""

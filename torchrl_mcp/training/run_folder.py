@@ -32,6 +32,9 @@ LOG = "train.log"
 CHECKPOINTS = "checkpoints"
 """The folder of checkpoints."""
 
+CHECKPOINT = "checkpoint-{:012d}.torchrl"
+"""Of a checkpoint file, by environment steps, as TorchRL's rotation has it."""
+
 PARTIAL = ".partial"
 """At the end of the name of a file that is being written."""
 
@@ -98,6 +101,23 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
             for row in csv.DictReader(file)
             if None not in row.values()
         ]
+
+
+def find_all(run: Path) -> list[Path]:
+    """Return the checkpoint files of a run folder that training wrote, the newest first."""
+    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
+    return sorted(
+        (path for path in (run / CHECKPOINTS).glob("checkpoint-*.torchrl") if frames(path) >= 0), reverse=True
+    )
+
+
+def frames(path: Path) -> int:
+    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written.
+
+    That of another file, such as a copy ``checkpoint-best.torchrl``, is -1.
+    """
+    step = path.stem.removeprefix("checkpoint-")
+    return int(step) if step.isdecimal() else -1
 
 
 def remove_leftovers(run: Path) -> None:
