@@ -1,0 +1,187 @@
+"""Faults on purpose: kills and full disks in training, damaged checkpoints, actions that no policy means.
+
+    python benchmarks/soak.py training    # 50 minutes, writes results/soak_training.csv
+    python benchmarks/soak.py flips       # a minute, writes results/soak_flips.csv
+    python benchmarks/soak.py steps       # half an hour, writes results/soak_steps.csv
+
+``--quick`` does less and writes nothing unless given ``--output``.
+
+*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 of every 35 to 75 seconds; where this
+user may not mount one, files may not grow at those times (``RLIMIT_FSIZE``). The main process alone gets SIGKILL after
+one to three minutes. What has ended is started again until it is done; then another run begins, until the minutes are
+over. ``slowest_end_s``: until the last process of a killed run was gone. ``wrong``: rows not numbered one by one, or
+with a loss that is no number, and steps that the csv logger lacks or has twice. ``changed``: rows before a checkpoint
+that are others after a resume. ``differing``: rows and contents of the last checkpoint that are not, bit for bit, those
+of a run that nobody disturbed (``collector=local``; workers begin new episodes).
+
+*flips*: one bit of a checkpoint, drawn at random, is inverted. ``harmless``: accepted, with every content as it was.
+
+*steps*: a third of the simulations gets targets drawn uniformly within their bounds, a third also sizes up to 1e12 and
+infinity, and a third also NaN. ``unfit`` actions are not finite or beyond MuJoCo's limit, and must end their episode
+with reward 0; ``missed`` are those that did not. ``diverged``: of all others. ``not_finite``: emitted numbers.
+"""
+
+import argparse
+import csv
+import math
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import count, zip_longest
+from pathlib import Path
+from typing import Any
+
+from report import about, table, write
+from soak_disk import Disk, small_disk
+from soak_inputs import SMALL, contents, flips, steps
+
+from torchrl_mcp.training import checkpoint, run_folder
+
+RESULTS = Path(__file__).resolve().parent / "results"
+BATCH = 512
+TRAIN = [sys.executable, "-m", "torchrl_mcp.cli.train"]
+SETTINGS = (
+    *SMALL,
+    *("logger=csv", "progress_bar=false", "num_threads=1", "torch_threads=1", "checkpoint_interval=10"),
+    *("training.num_envs=16", f"training.frames_per_batch={BATCH}", "training.minibatch_size=128"),
+)
+KILL = (60.0, 180.0)
+"""Seconds after which a run is killed, at least and at most."""
+
+
+def attempt(settings: list[str], disk: Disk, log: Path, patience: float) -> tuple[str, float]:
+    """Run training until it ends or is killed; return how, and the seconds until all its processes were gone."""
+    with log.open("wb") as file:
+        process = subprocess.Popen([*TRAIN, *settings], stdout=file, stderr=file, start_new_session=True)
+    deadline = time.monotonic() + patience
+    while process.poll() is None and time.monotonic() < deadline:
+        disk.pass_time(process)
+        time.sleep(0.1)
+    killed = process.poll() is None
+    process.kill()
+    process.wait()
+    began = time.monotonic()
+    while any(_group(stat) == process.pid for stat in Path("/proc").glob("[0-9]*/stat")):
+        time.sleep(0.05)
+    said = log.read_text(errors="replace").strip().rpartition("\n")[2]
+    full = any(text in said for text in ("No space left", "File too large"))
+    how = "killed" if killed else "done" if not process.returncode else "disk_full" if full else said
+    return how, time.monotonic() - began
+
+
+def _group(stat: Path) -> int:
+    """Return the process group of a process that lives, or 0."""
+    with suppress(OSError):
+        state, _, group = stat.read_text().rpartition(")")[2].split()[:3]
+        return 0 if state == "Z" else int(group)
+    return 0
+
+
+def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: bool) -> dict[str, Any]:
+    """Train, and start again after each end, until the run is done."""
+    ends: Counter[str] = Counter()
+    slowest, changed, before, began = 0.0, 0, [], time.monotonic()
+    while not ends["done"]:
+        begun = (folder / run_folder.CONFIG).exists()
+        patience = math.inf if quick and ends["killed"] else random.uniform(*KILL) / (4 if quick else 1)
+        how, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, patience)
+        if how not in ("killed", "disk_full", "done"):
+            print(log.read_text(errors="replace")[-3000:], flush=True)
+        ends[how] += 1
+        slowest = max(slowest, seconds)
+        now = rows(folder)
+        changed += sum(old != new for old, new in zip(before, now, strict=False)) + max(len(before) - len(now), 0)
+        saved = max((run_folder.frames(path) for path in run_folder.find_all(folder)), default=0)
+        before = [row for row in now if row["frames"] and int(row["frames"]) <= saved]
+    known = {how: ends.pop(how) for how in ("killed", "disk_full", "done")}
+    minutes = round((time.monotonic() - began) / 60, 1)
+    return {
+        "minutes": minutes,
+        **known,
+        "other_ends": ends.total(),
+        "slowest_end_s": round(slowest, 1),
+        "changed": changed,
+    }
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    """Return the whole rows of a run's metrics, without times."""
+    path = folder / run_folder.METRICS
+    if not path.exists():
+        return []
+    text = path.read_text()
+    whole = csv.DictReader(text[: text.rfind("\n") + 1].splitlines())
+    return [{key: row[key] for key in row if not key.startswith(("seconds", "time/"))} for row in whole]
+
+
+def wrong(folder: Path, total: int) -> int:
+    """Count what no run may write."""
+    steps, found = [str(frames) for frames in range(BATCH, total + 1, BATCH)], rows(folder)
+    logged = [line.partition(",")[0] for line in (folder / "csv/scalars/reward.csv").read_text().splitlines()]
+    lists = ([row["frames"] for row in found], logged)
+    misplaced = sum(step != other for others in lists for step, other in zip_longest(steps, others))
+    losses = (float(value) for row in found for name, value in row.items() if name.startswith("loss/"))
+    return misplaced + sum(not math.isfinite(loss) for loss in losses)
+
+
+def differing(first: Path, second: Path) -> int:
+    """Count the rows and the contents of the last checkpoint in which two runs differ."""
+    states = [contents(checkpoint.find(folder)) for folder in (first, second)]
+    names = states[0].keys() | states[1].keys()
+    return sum(a != b for a, b in zip_longest(rows(first), rows(second))) + sum(
+        states[0].get(name) != states[1].get(name) for name in names
+    )
+
+
+def training(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Kill runs and fill their disk."""
+    total = 20 * BATCH if args.quick else args.frames
+    end = time.monotonic() + 60 * args.minutes
+    for seed in count():
+        common = [*SETTINGS, f"seed={seed}", f"training.total_frames={total}"]
+        with small_disk(0.1 if args.quick else 1.0) as (folder, disk), tempfile.TemporaryDirectory() as calm:
+            whole, log = Path(calm) / "whole", Path(calm) / "log"
+            subprocess.run([*TRAIN, *common, f"run_dir={whole}"], check=True, stdout=subprocess.DEVNULL)
+            for collector in ("local", "processes"):
+                run = folder / collector
+                settings = [*common, f"collector={collector}", f"run_dir={run}"]
+                row = {"collector": collector, "seed": seed, "frames": total, "disk": disk.kind}
+                row |= disturbed(run, settings, disk, log, args.quick)
+                row |= {"rows": len(rows(run)), "wrong": wrong(run, total)}
+                yield row | {"differing": differing(whole, run) if collector == "local" else ""}
+                shutil.rmtree(run)
+        if args.quick or time.monotonic() > end:
+            return
+
+
+def main() -> None:
+    """Do harm, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["training", "flips", "steps"])
+    parser.add_argument("--minutes", type=float, default=50.0, help="of training (default 50)")
+    parser.add_argument("--frames", type=int, default=400 * BATCH, help=f"of each run (default {400 * BATCH:,})")
+    parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
+    parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
+    parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")
+    parser.add_argument("--quick", action="store_true", help="do less")
+    parser.add_argument("--output", type=Path, help="CSV file; without --quick there is a default")
+    args = parser.parse_args()
+    output = args.output or (None if args.quick else RESULTS / f"soak_{args.what}.csv")
+    output = output and output.resolve()
+    random.seed(0)
+    conditions, measured = {"command": " ".join(["python", *sys.argv]), **about()}, []
+    for row in {"training": training, "flips": flips, "steps": steps}[args.what](args):
+        print(table([row]), flush=True)
+        measured.append({**row, **conditions})
+        if output:  # what an interruption leaves counts
+            write(output, measured)
+
+
+if __name__ == "__main__":
+    main()

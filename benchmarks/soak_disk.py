@@ -1,0 +1,52 @@
+"""A small disk that fills now and then: a part of ``soak.py``."""
+
+import random
+import resource
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+FULL, FREE = (5.0, 15.0), (30.0, 60.0)
+"""Seconds that the disk is full, and that it has room, at least and at most."""
+
+
+class Disk:
+    """A small disk that fills now and then."""
+
+    def __init__(self, folder: Path, pace: float) -> None:
+        mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)]
+        self.mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
+        self.kind = "tmpfs of 16 MB" if self.mounted else "RLIMIT_FSIZE"
+        self._filler, self._pace = folder / "filler", pace
+        self._full, self._next = False, time.monotonic() + pace * random.uniform(*FREE)
+
+    def pass_time(self, process: "subprocess.Popen[bytes]") -> None:
+        """Fill the disk, or empty it, if it is time."""
+        if time.monotonic() < self._next:
+            return
+        self._full = not self._full
+        self._next = time.monotonic() + self._pace * random.uniform(*(FULL if self._full else FREE))
+        if not self.mounted:
+            limit = 2**15 if self._full else resource.RLIM_INFINITY
+            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        elif self._full:
+            with suppress(OSError), self._filler.open("wb", buffering=0) as file:
+                while file.write(bytes(2**16)):
+                    pass
+        else:
+            self._filler.unlink()
+
+
+@contextmanager
+def small_disk(pace: float) -> Iterator[tuple[Path, Disk]]:
+    """Give a folder on a small disk."""
+    with tempfile.TemporaryDirectory() as name:
+        disk = Disk(Path(name), pace)
+        try:
+            yield Path(name), disk
+        finally:
+            if disk.mounted:
+                subprocess.run(["umount", name], check=True)

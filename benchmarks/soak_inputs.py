@@ -1,0 +1,120 @@
+"""Damaged checkpoints, and actions that no policy means: parts of ``soak.py``."""
+
+import argparse
+import math
+import os
+import random
+import re
+import tempfile
+import time
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from itertools import product
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import torch
+
+from torchrl_mcp.envs.simulation import LARGEST
+from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.training import checkpoint
+
+SMALL = ("method=mcp", "task=holdout", "stage=pretrain", "preset=smoke", "width=0.0625", "autocast=false")
+"""Settings of a run that is soon trained and has small checkpoints."""
+
+TASKS = [("holdout", "ant"), *product(("imitation", "heading", "carry", "dribble"), ("biped", "humanoid", "trex"))]
+
+
+def contents(path: Path) -> Mapping[str, bytes]:
+    """Return all that a checkpoint holds, but for times and the generators of random numbers."""
+    with ZipFile(path) as archive:
+        names = [
+            name for name in archive.namelist() if not re.match(r"manifest|components/\d+-(progress|random)", name)
+        ]
+        return {name: archive.read(name) for name in names}
+
+
+def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Damage a checkpoint and try to read it, as a resume and as an evaluation would."""
+    with tempfile.TemporaryDirectory() as name:
+        cfg = build.compose_run(*SMALL, f"run_dir={name}/run", "logger=none", "progress_bar=false")
+        path, copy = checkpoint.find(experiment.train(cfg)), Path(name) / "damaged.torchrl"
+        _, agent, _ = experiment.restore(path, num_envs=1, seed=0)
+        whole = {key: value.clone() for key, value in agent.parts.state_dict().items()}
+        original, results = path.read_bytes(), {check: Counter[str]() for check in ("resume", "evaluate")}
+        for _ in range(20 if args.quick else args.flips):
+            data = bytearray(original)
+            data[random.randrange(len(data))] ^= 1 << random.randrange(8)
+            copy.write_bytes(data)
+            intact = checkpoint.is_intact(copy)
+            results["resume"]["refused" if not intact else outcome(contents(copy) == contents(path))] += 1
+            for value in agent.parts.state_dict().values():
+                value.zero_()
+            try:
+                checkpoint.load_agent(agent.parts, copy)
+            except ValueError:
+                results["evaluate"]["refused"] += 1
+                continue
+            same = all(torch.equal(value, whole[key]) for key, value in agent.parts.state_dict().items())
+            results["evaluate"][outcome(same)] += 1
+    for check, tally in results.items():
+        counts = {name: tally[name] for name in ("refused", "harmless", "accepted_wrongly")}
+        yield {"check": check, "bytes": len(original), "flips": tally.total(), **counts}
+
+
+def outcome(same: bool) -> str:
+    """Name what was accepted."""
+    return "harmless" if same else "accepted_wrongly"
+
+
+def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Act as no policy means to, in all tasks with all characters."""
+    os.chdir(tempfile.mkdtemp())  # where MuJoCo writes its warnings
+    num_envs, total = (6, 60 * len(TASKS)) if args.quick else (768, args.steps)
+    for task, character in TASKS:
+        stage = "pretrain" if task in ("holdout", "imitation") else "transfer"
+        cfg = build.compose_run(f"task={task}", f"character={character}", f"stage={stage}")
+        env = build.make_env(cfg, num_envs=num_envs, seed=0, num_threads=args.threads)
+        generator, tally, before, began = torch.Generator().manual_seed(0), Counter[str](), warned(), time.monotonic()
+        state = env.reset()
+        with warnings.catch_warnings(record=True) as complaints:
+            warnings.simplefilter("always")
+            for _ in range(math.ceil(total / len(TASKS) / num_envs)):
+                action = actions(env.action_spec.low, env.action_spec.high, generator)
+                unfit = ~(action.abs() < LARGEST).all(-1)
+                taken, state = env.step_and_maybe_reset(state.set("action", action))
+                ended = taken["next", "terminated"].squeeze(-1) & (taken["next", "reward"].squeeze(-1) == 0)
+                emitted = [taken["next", key] for key in ("observation", "goal", "reward")] + [state["observation"]]
+                tally.update(
+                    steps=num_envs,
+                    episodes=int(taken["next", "done"].sum()),
+                    unfit=int(unfit.sum()),
+                    missed=int((unfit & ~ended).sum()),
+                    not_finite=sum(int((~value.isfinite()).sum()) for value in emitted),
+                )
+        seconds = time.monotonic() - began
+        tally["diverged"] = env.num_diverged - tally["unfit"]
+        tally["mujoco_warnings"], tally["python_warnings"] = warned() - before, len(complaints)
+        names = ("steps", "episodes", "unfit", "missed", "diverged", "not_finite", "mujoco_warnings", "python_warnings")
+        yield {"task": task, "character": character, **{name: tally[name] for name in names}} | {
+            "steps_per_second": round(tally["steps"] / seconds)
+        }
+
+
+def actions(low: torch.Tensor, high: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Draw actions: within the bounds, of any size, and with NaN, each for a third of the simulations."""
+    third = len(low) // 3
+    drawn = low + (high - low) * torch.rand(low.shape, generator=generator)
+    sizes = 10 ** (12 * torch.rand(third, 1, generator=generator))
+    drawn[third : 2 * third] *= torch.where(sizes < 5e11, sizes, torch.inf)
+    chosen = torch.rand(third, low.shape[-1], generator=generator) < 0.1 / low.shape[-1]
+    drawn[2 * third : 3 * third][chosen] = torch.nan
+    return drawn
+
+
+def warned() -> int:
+    """Count the warnings in MuJoCo's log of the working directory."""
+    log = Path("MUJOCO_LOG.TXT")
+    return log.read_text().count("WARNING") if log.exists() else 0
