@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_module
 
 from torchrl_mcp.runs import experiment
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.viewer.watch import Watch
 
 
@@ -18,7 +18,7 @@ def run(tmp_path):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         experiment.train(compose("train", [*settings, "method=scratch", "task=heading", "stage=transfer"]))
-    later, earlier = checkpoint.find_all(folder)
+    later, earlier = run_folder.find_all(folder)
     aside = tmp_path / later.name
     later.rename(aside)
     return folder, earlier, aside
@@ -37,7 +37,7 @@ def test_each_new_checkpoint_is_taken_up_and_a_damaged_one_is_passed_over(run, c
     _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
     watch = Watch(folder, agent.parts, interval=0.0)
     assert watch()
-    assert watch.frames == checkpoint.frames(earlier) == 256
+    assert watch.frames == run_folder.frames(earlier) == 256
     first = numbers(agent.parts)
     assert not watch()
 

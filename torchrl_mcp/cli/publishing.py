@@ -11,7 +11,7 @@ from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.run_folder import PROVENANCE, read_json
 
 PLACES = ("run_dir=", "run_root=", "resume=")
@@ -36,7 +36,7 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
     card = output.with_suffix(".md")
     card.write_text(
-        model_card(output, cfg, numbers, origin, steps=checkpoint.frames(checkpoint.find(run)), limits=limits)
+        model_card(output, cfg, numbers, origin, steps=run_folder.frames(checkpoint.find(run)), limits=limits)
     )
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
 

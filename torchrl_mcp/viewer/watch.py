@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torch import nn
 
-from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training import checkpoint, run_folder
 
 
 class Watch:
@@ -34,7 +34,7 @@ class Watch:
         if time.monotonic() < self._next_look:
             return False
         self._next_look = time.monotonic() + self._interval
-        return any(self._take(path) for path in checkpoint.find_all(self._run) if checkpoint.frames(path) > self.frames)
+        return any(self._take(path) for path in run_folder.find_all(self._run) if run_folder.frames(path) > self.frames)
 
     def _take(self, path: Path) -> bool:
         """Load a checkpoint, unless it is damaged."""
@@ -51,6 +51,6 @@ class Watch:
         except (FileNotFoundError, ValueError):  # training has removed it meanwhile, or it is of another run
             return False
         self._parts.load_state_dict(loaded.state_dict())
-        self.frames = checkpoint.frames(path)
+        self.frames = run_folder.frames(path)
         print(f"{path.name}: {self.frames:,} steps", flush=True)
         return True
