@@ -6,7 +6,7 @@
 
 ``--quick`` does less and writes nothing unless given ``--output``.
 
-*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 of every 35 to 75 seconds; where this
+*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180; where this
 user may not mount one, files may not grow at those times (``RLIMIT_FSIZE``). The main process alone gets SIGKILL after
 one to three minutes. What has ended is started again until it is done; then another run begins, until the minutes are
 over. ``slowest_end_s``: until the last process of a killed run was gone. ``wrong``: rows not numbered one by one, or
@@ -48,7 +48,7 @@ BATCH = 512
 TRAIN = [sys.executable, "-m", "torchrl_mcp.cli.train"]
 SETTINGS = (
     *SMALL,
-    *("logger=csv", "progress_bar=false", "num_threads=1", "torch_threads=1", "checkpoint_interval=10"),
+    *("logger=csv", "progress_bar=false", "num_threads=1", "torch_threads=1", "checkpoint_interval=5"),
     *("training.num_envs=16", f"training.frames_per_batch={BATCH}", "training.minibatch_size=128"),
 )
 KILL = (60.0, 180.0)
@@ -165,7 +165,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["training", "flips", "steps"])
     parser.add_argument("--minutes", type=float, default=50.0, help="of training (default 50)")
-    parser.add_argument("--frames", type=int, default=400 * BATCH, help=f"of each run (default {400 * BATCH:,})")
+    parser.add_argument("--frames", type=int, default=100 * BATCH, help=f"of each run (default {100 * BATCH:,})")
     parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
     parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-FULL, FREE = (5.0, 15.0), (30.0, 60.0)
+FULL, FREE = (5.0, 15.0), (90.0, 180.0)
 """Seconds that the disk is full, and that it has room, at least and at most."""
 
 
