@@ -117,9 +117,10 @@ def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatc
 @pytest.mark.parametrize(
     "gate", sorted(filter(builtin.has_task, PRETRAINED.parent.glob("*.torchrl"))), ids=lambda p: p.stem
 )
-def test_every_gate_that_comes_with_the_library_has_a_card_and_returns_more_than_standing_still(gate):
+def test_every_gate_that_comes_with_the_library_has_a_card_and_does_its_task(gate):
     page = (gate.parents[2] / "docs" / "networks.md").read_text()
     assert gate.with_suffix(".md").is_file()
     assert f"networks/{gate.stem}.md" in page
-    numbers = experiment.evaluate_run(gate, episodes=8, seed=0, max_episode_steps=300)["deterministic"]
-    assert numbers["reach"]["place"] > 0.2
+    numbers = experiment.evaluate_run(gate, episodes=4, seed=0, max_episode_steps=120)["deterministic"]
+    assert numbers["terminated"] == 0.0
+    assert numbers["reach"]["place"] > (0.5 if "heading" in gate.stem else 0.0)

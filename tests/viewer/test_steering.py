@@ -64,6 +64,21 @@ def test_let_go_the_direction_wanders_again():
     assert 0 < abs(target(steering) - 1.0) <= 0.15
 
 
+def test_the_humanoid_walks_where_it_is_steered():
+    _, agent, env = restore(builtin("mcp", "humanoid", "heading"), num_envs=1, seed=0, initial_states="rest")
+    steering = Steering(Player(agent.actor.policy, env))
+    for angle in (0.0, 90.0):
+        steering.aim(math.radians(angle))
+        places = []
+        for _ in range(90):
+            steering.step()
+            assert not steering.player.began  # no fall
+            places.append(steering.player.data.subtree_com[1, :2].copy())
+        way = places[-1] - places[-31]
+        assert np.linalg.norm(way) == pytest.approx(1.0, abs=0.15)  # metres in a second
+        assert math.degrees(math.atan2(way[1], way[0])) == pytest.approx(angle, abs=15.0)
+
+
 @pytest.mark.parametrize("task", [Carry, Dribble])
 def test_a_target_is_where_it_is_put(task):
     steering = idle(task)

@@ -1,4 +1,5 @@
 import contextlib
+import math
 import socket
 import threading
 import time
@@ -18,7 +19,7 @@ from torchrl_mcp.envs import Heading
 from torchrl_mcp.viewer.guard import refusal
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.steering import Steering
-from torchrl_mcp.viewer.web import Deed, Hands, Pace, Stage, play_in_browser
+from torchrl_mcp.viewer.web import KEYS, Deed, Hands, Pace, Stage, play_in_browser
 
 IDLE = TensorDictModule(lambda goal: torch.zeros(len(goal), 17), in_keys=["goal"], out_keys=["action"])
 
@@ -117,12 +118,15 @@ def test_the_pace_is_what_the_controls_say():
 
 
 def test_what_is_done_in_the_browser_is_done_to_the_player():
+    from mujoco.experimental.dear_imgui import dear_imgui as imgui
     from mujoco.experimental.studio import messages
 
     steering = Steering(Brief())
     hands = Hands(steering)
     hands.on_deed(Deed(lambda steering: steering.aim(1.0)))
     assert steering.direction == 1.0
+    hands.on_deed(Deed(KEYS[imgui.Key.LeftArrow]))
+    assert steering.direction == pytest.approx(1.0 + math.radians(15))
     steering.step()
     hands.on_reset(messages.ResetEvent(key=-1))
     assert steering.player.began

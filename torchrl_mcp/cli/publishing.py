@@ -78,8 +78,8 @@ torchrl-mcp-play {checkpoint_name} --viewer web
 
 ## Returns
 
-Normalised return of the file as it is here, in {numbers["episodes"]} episodes of the task as the paper has it (seed
-{numbers["seed"]}), with its 95 % interval.
+Normalised return of the file as it is here, in the task as the paper has it: {numbers["episodes"]} episodes,
+seed {numbers["seed"]}, with the 95 % interval.
 
 {returns}
 

@@ -15,7 +15,7 @@ Act = Callable[[Steering], None]
 WIDTH, HEIGHT = 160.0, 14.0
 """Of a bar, in pixels."""
 
-KEYS = "space: pause   - =: slower, faster\nbackspace: new episode\ndouble-click, ctrl + right drag: push"
+KEYS = "drag a body: push\nspace: pause   - =: slower, faster\nup, down: one primitive alone"
 
 
 def draw(steering: Steering, weights: Weights | None, do: Callable[[Act], None]) -> None:
@@ -35,7 +35,7 @@ def draw(steering: Steering, weights: Weights | None, do: Callable[[Act], None])
             do(lambda steering: steering.aim(angle))
         imgui.TextDisabled("left, right: turn by 15 degrees")
     if steering.has_place:
-        imgui.TextDisabled("double-click on the ground: place the target")
+        imgui.TextDisabled("click on the ground: place the target")
     if weights is not None:
         _draw_weights(steering, weights, do)
     if imgui.Button("new episode"):

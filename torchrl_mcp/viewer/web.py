@@ -11,6 +11,7 @@ from torchrl_mcp.envs.rendering import Shape
 from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.guard import HERE, guarded
+from torchrl_mcp.viewer.mouse import Mouse
 from torchrl_mcp.viewer.panel import Act, draw
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import TURN, Steering
@@ -56,6 +57,7 @@ class Stage(viewer_app.ViewerApp):
         self.shapes: list[Shape] = []
         self.weights: Weights | None = None
         self._steering, self._distance = steering, distance
+        self._mouse = Mouse(lambda place: self._do(lambda steering: steering.put(place)))
         super().__init__(viewer_app.ViewerAppConfig(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
@@ -75,13 +77,9 @@ class Stage(viewer_app.ViewerApp):
         super().handle_keyboard_events()
 
     def handle_mouse_events(self) -> None:
-        """Put the target where the ground is double-clicked, which Studio takes for the choice of a body to push."""
-        super().handle_mouse_events()
-        perturb = self.viewer.perturb
-        chosen = imgui.IsMouseDoubleClicked(imgui.MouseButton.Left) and not imgui.GetIO().WantCaptureMouse
-        if chosen and perturb.select == 0 and perturb.localpos.any():
-            place = perturb.localpos.copy()
-            self._do(lambda steering: steering.put(place))
+        """Drag bodies and put the target; the rest is Studio's."""
+        if not self._mouse.handle(self.viewer):
+            super().handle_mouse_events()
 
     @messages.handler
     def on_update(self, _: messages.UpdateEvent) -> None:

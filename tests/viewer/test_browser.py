@@ -1,0 +1,165 @@
+"""Steering in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``."""
+
+import contextlib
+import shutil
+import threading
+import time
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as MuJoCo 3.17 has it")
+
+from playwright import sync_api as playwright
+
+from torchrl_mcp.envs import Dribble
+from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.viewer.web import play_in_browser
+
+CHROMIUM = next(filter(None, map(shutil.which, ["chromium", "chromium-browser", "google-chrome"])), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed: apt-get install chromium")
+
+PATIENCE = 90.0
+"""Seconds: without a GPU a browser draws a picture in one or more."""
+
+LONG = 2000
+"""Milliseconds between what the mouse does, for the same reason."""
+
+WIDTH, HEIGHT = 560, 440
+
+GATED = TensorDictSequential(
+    TensorDictModule(lambda goal: torch.tensor([[0.2, 0.8]]), in_keys=["goal"], out_keys=["gates"]),
+    TensorDictModule(lambda gates: torch.zeros(1, 17), in_keys=["gates"], out_keys=["action"]),
+)
+
+
+class Stop(Exception):
+    pass
+
+
+class Show(Player):
+    """A character that holds still, until told to stop."""
+
+    def __init__(self, task, **settings):
+        super().__init__(GATED, task("biped", 1, seed=0, num_threads=1, terminate_on_fall=False, **settings))
+        self.over, self.steps, self.pushed = False, 0, 0.0
+
+    def step(self):
+        self.pushed = max(self.pushed, float(self.env.simulation.state["xfrc_applied"].abs().max()))
+        super().step()
+        self.steps += 1
+
+    @property
+    def data(self):
+        if self.over:
+            raise Stop
+        return super().data
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        # Chromium's sandbox does not start for root, as in containers; WebGL by the processor where there is no GPU.
+        flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def visit(browser, monkeypatch, tmp_path, capfd):
+    """Opens the page of a player."""
+    monkeypatch.setenv("HOME", str(tmp_path))  # where Studio keeps its settings
+    opened = []
+
+    def visit(player):
+        def run():
+            with contextlib.suppress(Stop):
+                play_in_browser(player, port=0)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        opened.append((player, thread, page := browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})))
+        wait(lambda: player.steps > 0)
+        said = capfd.readouterr().out
+        drawn = []
+        page.on("console", lambda message: drawn.append("First remote draw frame" in message.text))
+        page.goto(next(word.strip(",") for word in said.split() if word.startswith("http")))
+        wait(lambda: any(drawn), page)
+        page.wait_for_timeout(2000)
+        return page
+
+    yield visit
+    for player, thread, page in opened:
+        page.close()
+        player.over = True
+        thread.join(10)
+        assert not thread.is_alive()  # two viewers in a process share their interface
+
+
+def wait(condition, page=None):
+    """Until a condition holds, or fail."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        page.wait_for_timeout(100) if page else time.sleep(0.1)
+
+
+def target(player):
+    """Where the target is. Tensors are read alone: the thread of the player computes what else MuJoCo says."""
+    return player.env.simulation.outputs["xpos"][0, player.env.simulation.model.body("target").id, :2]
+
+
+def hold(page, key, condition):
+    """Hold a key until a condition holds."""
+    page.keyboard.down(key)
+    wait(condition, page)
+    page.keyboard.up(key)
+    page.wait_for_timeout(LONG)
+
+
+def move(page, x, y):
+    page.mouse.move(x, y)
+    page.wait_for_timeout(LONG)
+
+
+def stands_still(player, page):
+    steps = player.steps
+    page.wait_for_timeout(500)
+    return player.steps == steps
+
+
+def test_what_is_done_in_the_browser_reaches_the_player(visit):
+    player = Show(Dribble, max_episode_steps=10**6)
+    page, state = visit(player), player.env.simulation.state
+
+    before = target(player).clone()  # a click on the ground places the target
+    move(page, WIDTH - 60, HEIGHT - 80)
+    page.mouse.down()
+    page.wait_for_timeout(2 * LONG)
+    page.mouse.up()
+    wait(lambda: (target(player) != before).any(), page)
+    assert torch.linalg.vector_norm(target(player) - player.env.simulation.outputs["xpos"][0, 1, :2]) < 4.0
+    assert player.pushed == 0.0
+
+    move(page, WIDTH / 2, HEIGHT / 2 + 10)  # a body that is dragged is pushed, until it is let go
+    page.mouse.down()
+    page.wait_for_timeout(LONG)
+    page.mouse.move(WIDTH / 2 + 60, HEIGHT / 2)
+    wait(lambda: player.pushed > 1.0, page)
+    page.mouse.up()
+    wait(lambda: not state["xfrc_applied"].any(), page)
+
+    hold(page, "ArrowDown", lambda: player.pinned)  # primitives act alone, one after another
+    move(page, 60, 122)  # a bar that is held pins its gate
+    page.mouse.down()
+    wait(lambda: player.pinned.get(0) not in (0.0, 1.0, None), page)
+    page.mouse.move(102, 122)
+    wait(lambda: player.pinned[0] == pytest.approx(0.5, abs=0.05), page)
+    page.mouse.up()
+
+    move(page, WIDTH / 2, HEIGHT - 80)
+    hold(page, " ", lambda: stands_still(player, page))
+    hold(page, "Backspace", lambda: state["time"][0] == 0.0)

@@ -1,0 +1,72 @@
+"""The left button of the mouse in the web viewer: it drags bodies, and a click on the ground chooses a place.
+
+Studio drags what was chosen by a double-click before, with a key held and another button. Its functions for that are
+used here.
+"""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco.experimental.dear_imgui import dear_imgui as imgui
+from mujoco.experimental.studio import ux, viewer_protocol
+
+SLACK = 5.0
+"""Pixels by which the mouse may move in a click."""
+
+
+class Mouse:
+    """What the left button does to the scene of a viewer.
+
+    Args:
+        choose: Told of the place on the ground that was clicked, ``(3,)`` in metres.
+    """
+
+    def __init__(self, choose: Callable[[np.ndarray], None]) -> None:
+        self._choose = choose
+        self._dragging = False
+        self._pressed: tuple[float, float, np.ndarray] | None = None  # on the ground: pixels, and the place
+
+    def handle(self, viewer: viewer_protocol.Viewer) -> bool:
+        """Take note of a frame's input; return whether a body is dragged, so that the camera is not."""
+        io = imgui.GetIO()
+        if self._dragging:
+            self._drag(viewer, io)
+        elif imgui.IsMouseReleased(imgui.MouseButton.Left) and self._pressed is not None:
+            x, y, place = self._pressed
+            self._pressed = None
+            if np.hypot(io.MousePos.x - x, io.MousePos.y - y) <= SLACK:
+                self._choose(place)
+        elif imgui.IsMouseClicked(imgui.MouseButton.Left):
+            self._pressed = None
+            if not (io.WantCaptureMouse or io.KeyCtrl or io.DisplaySize.x <= 0):
+                self._press(viewer, io)
+        return self._dragging
+
+    def _press(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
+        """Take hold of the body under the mouse if it can move, or note the place on the ground."""
+        model, data, perturb, picked = viewer.model, viewer.data, viewer.perturb, _pick(viewer, io)
+        if picked.body == 0:
+            self._pressed = io.MousePos.x, io.MousePos.y, np.array(picked.point)
+        elif picked.body > 0 and model.body_weldid[picked.body] > 0:
+            perturb.select, perturb.flexselect, perturb.skinselect = picked.body, -1, -1
+            arm = np.array(picked.point) - data.xpos[picked.body]
+            perturb.localpos = data.xmat[picked.body].reshape(3, 3).T @ arm
+            ux.InitPerturb(model, data, viewer.camera, perturb, int(mujoco.mjtPertBit.mjPERT_TRANSLATE))
+            self._dragging = True
+
+    def _drag(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
+        """Move what is held, in the vertical plane or with Shift in the horizontal one, or let go of it."""
+        if not imgui.IsMouseDown(imgui.MouseButton.Left):
+            viewer.perturb.active, self._dragging = 0, False
+            return
+        plane = mujoco.mjtMouse.mjMOUSE_MOVE_H if io.KeyShift else mujoco.mjtMouse.mjMOUSE_MOVE_V
+        way = io.MouseDelta.x / io.DisplaySize.x, io.MouseDelta.y / io.DisplaySize.y
+        ux.MovePerturb(viewer.model, viewer.data, viewer.camera, viewer.perturb, int(plane), *way)
+
+
+def _pick(viewer: viewer_protocol.Viewer, io: imgui.IO) -> ux.PickResult:
+    """Return what is under the mouse."""
+    size = io.DisplaySize
+    place = io.MousePos.x / size.x, io.MousePos.y / size.y
+    return ux.Pick(viewer.model, viewer.data, viewer.camera, *place, size.x / size.y, viewer.vis_options)
