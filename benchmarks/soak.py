@@ -6,13 +6,13 @@
 
 ``--quick`` does less and writes nothing unless given ``--output``.
 
-*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180; where this
-user may not mount one, files may not grow at those times (``RLIMIT_FSIZE``). The main process alone gets SIGKILL after
-one to three minutes. What has ended is started again until it is done; then another run begins, until the minutes are
-over. ``slowest_end_s``: until the last process of a killed run was gone. ``wrong``: rows not numbered one by one, or
-with a loss that is no number, and steps that the csv logger lacks or has twice. ``changed``: rows before a checkpoint
-that are others after a resume. ``differing``: rows and contents of the last checkpoint that are not, bit for bit, those
-of a run that nobody disturbed (``collector=local``; workers begin new episodes).
+*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180; where
+this user may not mount one, files may not grow at those times (``RLIMIT_FSIZE``). The main process alone gets SIGKILL
+after one to three minutes. What has ended is started again until it is done; then another run begins, until the minutes
+are over. ``slowest_end_s``: until the last process of a killed run was gone. ``wrong``: rows not numbered one by one,
+or with a loss that is no number, and steps that the csv logger lacks or has twice. ``changed``: rows before a
+checkpoint that are others after a resume. ``differing``: rows and contents of the last checkpoint that are not, bit for
+bit, those of a run that nobody disturbed (``collector=local``; workers begin new episodes).
 
 *flips*: one bit of a checkpoint, drawn at random, is inverted. ``harmless``: accepted, with every content as it was.
 

@@ -64,6 +64,47 @@ def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):
     assert all(0 < float(row["standing"]) < float(row["ideal"]) <= 1 for row in rows)
 
 
+@pytest.fixture
+def soak(tmp_path, monkeypatch):
+    """Run a part of the soak in this process, and give its rows."""
+
+    def run(what):
+        monkeypatch.syspath_prepend(BENCHMARKS)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["soak.py", what, "--quick", "--output", str(tmp_path / "out.csv")])
+        runpy.run_path(str(BENCHMARKS / "soak.py"))["main"]()
+        with (tmp_path / "out.csv").open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    return run
+
+
+def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(soak):
+    rows = soak("flips")
+    assert [row["check"] for row in rows] == ["resume", "evaluate"]
+    for row in rows:
+        assert int(row["refused"]) > 0
+        assert int(row["refused"]) + int(row["harmless"]) == int(row["flips"]) == 20
+
+
+def test_the_soak_acts_unfitly_in_every_task_and_all_that_comes_of_it_is_an_end_of_the_episode(soak):
+    rows = soak("steps")
+    assert len({(row["task"], row["character"]) for row in rows}) == 13
+    assert sum(int(row["unfit"]) for row in rows) > 30
+    assert all(row["missed"] == row["not_finite"] == "0" for row in rows)
+
+
+@pytest.mark.slow
+def test_the_soak_kills_runs_and_fills_their_disk_and_what_comes_of_them_is_what_nobody_disturbed(soak):
+    rows = soak("training")
+    assert [row["collector"] for row in rows] == ["local", "processes"]
+    for row in rows:
+        assert int(row["killed"]) > 0
+        assert row["other_ends"] == row["changed"] == row["wrong"] == "0"
+        assert float(row["slowest_end_s"]) < 30
+    assert rows[0]["differing"] == "0"
+
+
 def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
     rows = run("primitive_reuse.py", tmp_path / "out.csv")
     pairs = [(row["character"], row["precision"]) for row in rows]

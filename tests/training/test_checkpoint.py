@@ -6,6 +6,7 @@ import os
 import pickle
 import random
 import shutil
+import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -156,6 +157,23 @@ def test_a_checkpoint_is_on_the_disk_before_the_one_before_goes(tmp_path, monkey
     first, second = "checkpoint-000000000100.torchrl", "checkpoint-000000000200.torchrl"
     assert flushed == [[first], [first, second]]  # the file, and then the folder with its name
     assert [path.name for path in find_all(tmp_path)] == [second]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files as Linux does")
+def test_where_a_tensor_finds_no_room_the_system_s_error_names_the_checkpoint_and_the_one_before_stays(tmp_path):
+    import resource
+
+    checkpoints, parts = rotation(tmp_path, keep_last=1), nn.ModuleDict({"gating": nn.Linear(400, 400)})
+    save(run_checkpoint(parts), checkpoints, step=100, config=CONFIG)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+        with pytest.raises(OSError, match=r"cannot write .*checkpoint-000000000200.torchrl: File too large"):
+            save(run_checkpoint(parts), checkpoints, step=200, config=CONFIG)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in checkpoints.directory.iterdir()] == ["checkpoint-000000000100.torchrl"]
+    load_parts(parts, ["gating"], find(tmp_path))
 
 
 def test_an_archive_that_unpacks_to_more_than_its_size_is_refused_before_it_is_unpacked(run, monkeypatch):

@@ -24,6 +24,9 @@ FOLDER = CHECKPOINTS
 DAMAGED = ".damaged"
 """At the end of the name of a checkpoint that could not be restored."""
 
+REFUSAL = re.compile(r"unable to .*file <.*: (.*)", re.DOTALL)
+"""What torch says when the system refuses it a file, with the system's reason."""
+
 # What torchrl, tensordict, zipfile and json raise when a file is damaged or of another kind.
 UNREADABLE = (
     AttributeError,
@@ -91,9 +94,19 @@ def rotation(run: Path, keep_last: int) -> CheckpointRotation:
 
 
 def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
-    """Write ``checkpoint`` among ``checkpoints``. It is on the disk before older ones are removed."""
-    with replacing(checkpoints.directory / CHECKPOINT.format(step)) as partial:
-        checkpoint.save(partial, metadata={"config": config})
+    """Write ``checkpoint`` among ``checkpoints``. It is on the disk before older ones are removed.
+
+    Raises:
+        OSError: If it cannot be written, as where the disk is full.
+    """
+    path = checkpoints.directory / CHECKPOINT.format(step)
+    try:
+        with replacing(path) as partial:
+            checkpoint.save(partial, metadata={"config": config})
+    except RuntimeError as error:
+        if not (refusal := REFUSAL.match(str(error))):
+            raise
+        raise OSError(f"cannot write {path}: {refusal[1]}") from error
     checkpoints.prune()
 
 
