@@ -99,7 +99,7 @@ def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: b
         changed += sum(old != new for old, new in zip(before, now, strict=False)) + max(len(before) - len(now), 0)
         saved = max((run_folder.frames(path) for path in run_folder.find_all(folder)), default=0)
         before = [row for row in now if row["frames"] and int(row["frames"]) <= saved]
-    known = {how: ends.pop(how) for how in ("killed", "disk_full", "done")}
+    known = {how: ends.pop(how, 0) for how in ("killed", "disk_full", "done")}
     minutes = round((time.monotonic() - began) / 60, 1)
     return {
         "minutes": minutes,
@@ -165,7 +165,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["training", "flips", "steps"])
     parser.add_argument("--minutes", type=float, default=50.0, help="of training (default 50)")
-    parser.add_argument("--frames", type=int, default=100 * BATCH, help=f"of each run (default {100 * BATCH:,})")
+    parser.add_argument("--frames", type=int, default=200 * BATCH, help=f"of each run (default {200 * BATCH:,})")
     parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
     parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")
