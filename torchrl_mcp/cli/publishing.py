@@ -87,7 +87,7 @@ seed {numbers["seed"]}, with the 95 % interval.
 
 ## Limits
 
-{chr(10).join(f"- {limit}" for limit in limits) or "None are known."}
+{chr(10).join(f"- {limit}" for limit in limits) or "- Not stated."}
 """
 
 

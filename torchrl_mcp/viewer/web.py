@@ -72,7 +72,7 @@ class Stage(viewer_app.ViewerApp):
         """Steer with the arrow keys; the others are Studio's."""
         if not imgui.GetIO().WantCaptureKeyboard:
             for key, act in KEYS.items():
-                if imgui.IsKeyPressed(key):
+                if imgui.IsKeyPressed(key, False):  # once, however long it is held
                     self._do(act)
         super().handle_keyboard_events()
 
