@@ -30,9 +30,10 @@ BACKENDS = [
 
 @pytest.fixture(autouse=True)
 def private_ray(monkeypatch):
-    """Keep Ray from writing into the home and from calling home."""
+    """Keep Ray from writing into the home and from calling home, and let it start on a busy machine."""
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "300")
 
 
 def configure(folder, *overrides):
