@@ -39,7 +39,7 @@ from typing import Any
 
 from report import about, table, write
 from soak_disk import Disk, small_disk
-from soak_inputs import SMALL, contents, flips, steps
+from soak_inputs import SMALL, TASKS, contents, flips, steps
 
 from torchrl_mcp.training import checkpoint, run_folder
 
@@ -168,6 +168,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200 * BATCH, help=f"of each run (default {200 * BATCH:,})")
     parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
+    tasks = sorted({task for task, _ in TASKS})
+    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks, help="of the steps (default all)")
     parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")
     parser.add_argument("--quick", action="store_true", help="do less")
     parser.add_argument("--output", type=Path, help="CSV file; without --quick there is a default")

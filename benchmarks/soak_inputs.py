@@ -73,7 +73,8 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Act as no policy means to, in all tasks with all characters."""
     os.chdir(tempfile.mkdtemp())  # where MuJoCo writes its warnings
     num_envs, total = (6, 60 * len(TASKS)) if args.quick else (768, args.steps)
-    for task, character in TASKS:
+    chosen = [(task, character) for task, character in TASKS if task in args.tasks]
+    for task, character in chosen:
         stage = "pretrain" if task in ("holdout", "imitation") else "transfer"
         cfg = build.compose_run(f"task={task}", f"character={character}", f"stage={stage}")
         env = build.make_env(cfg, num_envs=num_envs, seed=0, num_threads=args.threads)
@@ -81,7 +82,7 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         state = env.reset()
         with warnings.catch_warnings(record=True) as complaints:
             warnings.simplefilter("always")
-            for _ in range(math.ceil(total / len(TASKS) / num_envs)):
+            for _ in range(math.ceil(total / len(chosen) / num_envs)):
                 action = actions(env.action_spec.low, env.action_spec.high, generator)
                 unfit = ~(action.abs() < LARGEST).all(-1)
                 taken, state = env.step_and_maybe_reset(state.set("action", action))
