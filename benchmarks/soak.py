@@ -147,8 +147,9 @@ def training(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         common = [*SETTINGS, f"seed={seed}", f"training.total_frames={total}"]
         with small_disk(0.1 if args.quick else 1.0) as (folder, disk), tempfile.TemporaryDirectory() as calm:
             whole, log = Path(calm) / "whole", Path(calm) / "log"
-            subprocess.run([*TRAIN, *common, f"run_dir={whole}"], check=True, stdout=subprocess.DEVNULL)
-            for collector in ("local", "processes"):
+            if "local" in args.collectors:
+                subprocess.run([*TRAIN, *common, f"run_dir={whole}"], check=True, stdout=subprocess.DEVNULL)
+            for collector in args.collectors:
                 run = folder / collector
                 settings = [*common, f"collector={collector}", f"run_dir={run}"]
                 row = {"collector": collector, "seed": seed, "frames": total, "disk": disk.kind}
@@ -168,6 +169,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200 * BATCH, help=f"of each run (default {200 * BATCH:,})")
     parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
+    sources = ["local", "processes"]
+    parser.add_argument("--collectors", nargs="+", choices=sources, default=sources, help="of training (default both)")
     tasks = sorted({task for task, _ in TASKS})
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks, help="of the steps (default all)")
     parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")
