@@ -9,13 +9,13 @@ from torch import Tensor
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.imitation import Imitation
 from torchrl_mcp.envs.motions.placement import Placement
-from torchrl_mcp.envs.rendering import Shape, arrow, ghost
+from torchrl_mcp.envs.rendering import Colour, Shape, arrow, ghost
 
-HAZE = (0.87, 0.90, 0.94, 1.0)
+HAZE: Colour = (0.87, 0.90, 0.94, 1.0)
 """Colour into which the ground fades."""
 
-ZENITH = (0.45, 0.62, 0.82)
-"""Colour of the sky above; at the horizon and below it is that of the haze."""
+ZENITH: Colour = (0.45, 0.62, 0.82, 1.0)
+"""Colour of the sky above."""
 
 GROUND = (150, 205)
 """Darkest and lightest pixel of the ground, of 255."""
@@ -43,11 +43,15 @@ def reference(env: Imitation, index: int = 0) -> Tensor:
     return env.library.at(clip, time, Placement(turn, shift)).qpos[0]
 
 
-def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
+def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour = ZENITH) -> mujoco.MjModel:
     """Return a copy of a scene in soft light, whose ground is pale, mirrors nothing and fades into :data:`HAZE`.
 
-    The sky, if it has one, is :data:`ZENITH` above and as the haze at the horizon and below. The haze is drawn where a
-    scene's flag ``mjRND_FOG`` is set.
+    The haze is drawn where a scene's flag ``mjRND_FOG`` is set.
+
+    Args:
+        model: The scene.
+        horizon: Colour of its sky, if it has one, at the horizon and below.
+        zenith: Colour of its sky above.
     """
     model = copy.copy(model)
     light = model.vis.headlight
@@ -62,11 +66,11 @@ def softly_lit(model: mujoco.MjModel) -> mujoco.MjModel:
         _fade(model, plane)
     for sky in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).tolist():
         pixels = _pixels(model, sky)
-        pixels[:] = sky_picture(model.tex_width[sky])[..., : model.tex_nchannel[sky]].reshape(-1)
+        pixels[:] = sky_picture(model.tex_width[sky], horizon, zenith)[..., : model.tex_nchannel[sky]].reshape(-1)
     return model
 
 
-def sky_picture(width: int) -> np.ndarray:
+def sky_picture(width: int, horizon: Colour, zenith: Colour) -> np.ndarray:
     """Return the six faces of a cube of sky, one below the other as MuJoCo has them, ``(6 * width, width, 3)``, uint8.
 
     Right, left, up, down, front and back; the first row of those at the sides is the uppermost.
@@ -76,7 +80,7 @@ def sky_picture(width: int) -> np.ndarray:
     heights = {"side": -side[:, None] / away, "up": 1 / away, "down": -1 / away}  # sines of the elevation
     faces = [heights[face] for face in ("side", "side", "up", "down", "side", "side")]
     share = np.concatenate(faces).clip(0, 1)[..., None]
-    return np.round(255 * ((1 - share) * HAZE[:3] + share * ZENITH)).astype(np.uint8)
+    return np.round(255 * ((1 - share) * horizon[:3] + share * zenith[:3])).astype(np.uint8)
 
 
 def extent(model: mujoco.MjModel) -> float:

@@ -59,7 +59,7 @@ class Steering:
         if self.has_direction:
             self.aim(self.target_direction + angle)
 
-    def put(self, place: Sequence[float]) -> None:
+    def put(self, place: Sequence[float] | np.ndarray) -> None:
         """Place the target of the ball or the box on the ground, x and y in metres."""
         if self.has_place:
             self.place = float(place[0]), float(place[1])

@@ -19,6 +19,9 @@ from torchrl_mcp.viewer.steering import TURN, Steering
 FURTHER = 1.4
 """Times as far as in a film is the camera: a notice of Studio covers the upper part of the page."""
 
+HORIZON, ZENITH = (0.45, 0.78, 1.0, 1.0), (0.25, 0.55, 1.0, 1.0)
+"""Of the sky, which Studio draws at a quarter of its brightness: the haze of films would be as grey as a wall."""
+
 KEYS: dict[imgui.Key, Act] = {
     imgui.Key.LeftArrow: lambda steering: steering.turn(TURN),
     imgui.Key.RightArrow: lambda steering: steering.turn(-TURN),
@@ -150,7 +153,7 @@ def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
     """
     steering, pace = Steering(player), Pace()
     stage = Stage(steering, distance=FURTHER * DISTANCE * player.extent)
-    model = softly_lit(player.env.simulation.model)
+    model = softly_lit(player.env.simulation.model, horizon=HORIZON, zenith=ZENITH)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
     with guarded(host), launch_web.launch(config, plugins=[stage, pace, Hands(steering)]) as viewer:
