@@ -37,9 +37,9 @@ import torch
 from report import about, table, write
 from torch import Tensor
 
+from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.pd_character import add_ground
-from torchrl_mcp.envs.simulation import Simulation
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CONTROL_RATE = 30
@@ -107,10 +107,10 @@ def let_legs_collide(spec: mujoco.MjSpec) -> None:
                     geom.contype, geom.conaffinity = contype, conaffinity
 
 
-def simulate(model: mujoco.MjModel, num_envs: int, threads: int, *outputs: str) -> Simulation:
+def simulate(model: mujoco.MjModel, num_envs: int, threads: int, *outputs: str) -> BatchSimulation:
     """Make simulations at 30 control steps per second, at the beginning."""
     substeps = round(1 / (CONTROL_RATE * model.opt.timestep))
-    simulation = Simulation(
+    simulation = BatchSimulation(
         model, num_envs, substeps=substeps, outputs=outputs, num_threads=threads, persistent=True, current=True
     )
     simulation.reset(torch.arange(num_envs), {})

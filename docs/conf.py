@@ -34,12 +34,13 @@ myst_heading_anchors = 3
 # network.
 nitpicky = True
 nitpick_ignore_regex = [
-    (r"py:.*", r"(argparse|collections|dataclasses|datetime|pathlib|typing)\..*"),
+    (r"py:.*", r"(abc|argparse|collections|dataclasses|datetime|pathlib|typing)\..*"),
     (r"py:.*", r"(gymnasium|hydra|matplotlib|mujoco|numpy|omegaconf|PIL|tensordict|torch|torchrl)\..*"),
     (r"py:class", r".*\._AcceptedKeys"),  # TorchRL's way of naming keys
     (r"py:class", r".*\.threads\.Result"),  # a type variable
 ]
 
+autodoc_mock_imports = ["mujoco_warp", "warp"]  # an extra
 autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"

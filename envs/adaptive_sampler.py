@@ -29,9 +29,9 @@ class AdaptiveSampler:
 
     def __init__(self, library: MotionLibrary) -> None:
         numbers = (library.durations / PERIOD).ceil().long().clamp_min(1)
-        self._clips = torch.arange(len(library)).repeat_interleave(numbers)
+        self._clips = torch.arange(len(library)).to(numbers.device).repeat_interleave(numbers)
         self._first = numbers.cumsum(0) - numbers
-        self._begins = PERIOD * (torch.arange(len(self._clips)) - self._first[self._clips])
+        self._begins = PERIOD * (torch.arange(len(self._clips)).to(numbers.device) - self._first[self._clips])
         self._durations, self._loops = library.durations, library.loops
         lasts = (library.durations[self._clips] - self._begins).clamp_max(PERIOD)
         self._weights = (library.weights / library.durations)[self._clips] * lasts
@@ -59,7 +59,7 @@ class AdaptiveSampler:
             self._weights * self.failures / self.steps, num, replacement=True, generator=generator
         )
         clips = self._clips[periods]
-        ahead, lead = torch.rand(2, num, generator=generator, dtype=torch.float64)
+        ahead, lead = torch.rand(2, num, generator=generator, dtype=torch.float64, device=clips.device)
         times = self._begins[periods] + PERIOD * (ahead - lead)
         return clips, times.clamp_min(0.0).minimum(self._durations[clips])
 
@@ -69,4 +69,4 @@ class AdaptiveSampler:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` gave."""
-        self.steps, self.failures = state["steps"].clone(), state["failures"].clone()
+        self.steps, self.failures = (state[name].to(self.steps.device, copy=True) for name in ("steps", "failures"))

@@ -11,10 +11,11 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_mcp.envs.engines import make_simulation
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.mirror import Mirror
 from torchrl_mcp.envs.rendering import Arrow, Camera
-from torchrl_mcp.envs.simulation import LARGEST, Simulation
+from torchrl_mcp.envs.simulation import LARGEST
 
 ALL = slice(None)
 """All simulations, as an index that takes no copy."""
@@ -36,13 +37,15 @@ class CharacterEnv(EnvBase):
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
         episode: What the task remembers of one simulation at first; kept as ``(N, ...)``.
-        outputs: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
-        model_fields: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
+        outputs: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        model_fields: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        physics: What simulates: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
+        device: Where simulations, rewards and what is emitted are; MuJoCo's threads need the CPU.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
-        persistent: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
-        current: See :class:`~torchrl_mcp.envs.simulation.Simulation`.
-        dtype: Type of what is emitted; physics and reward are computed in float64.
+        persistent: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        current: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        dtype: Type of what is emitted; rewards are computed in float64, physics in the type of the engine.
         pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
             TorchRL merges what a partial reset emits into new tensors, which are not pinned.)
 
@@ -63,6 +66,8 @@ class CharacterEnv(EnvBase):
         episode: Mapping[str, Tensor],
         outputs: Sequence[str] = (),
         model_fields: Sequence[str] = (),
+        physics: str = "mujoco",
+        device: torch.device | str = "cpu",
         seed: int | None = None,
         num_threads: int = 0,
         persistent: bool = False,
@@ -80,12 +85,14 @@ class CharacterEnv(EnvBase):
                 raise ValueError(f"{name}={value} is too small: pass at least {least}")
         if pin_memory and not torch.cuda.is_available():
             raise ValueError("pin_memory=True speeds up copies to a CUDA device, and none is available: pass False")
-        super().__init__(device="cpu", batch_size=[num_envs])
+        super().__init__(device=torch.device(device), batch_size=[num_envs])
         self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
         self.control_timestep = substeps * model.opt.timestep
-        self.simulation = Simulation(
+        self.simulation = make_simulation(
             model,
             num_envs,
+            physics=physics,
+            device=self.device,
             substeps=substeps,
             outputs=outputs,
             model_fields=model_fields,
@@ -94,11 +101,14 @@ class CharacterEnv(EnvBase):
             current=current,
         )
         episode = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
-        self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()}
+        self.episode = {
+            key: value.to(self.device).repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()
+        }
         self.num_diverged = 0
+        self._everybody = torch.arange(num_envs).to(self.device)
         self._snapshot: TensorDict | None = None
         self._observed: dict[str, Tensor] = {}
-        self.generator = torch.Generator()
+        self.generator = torch.Generator(self.device)
         self.set_seed(seed)
         self._dtype, self._pin_memory = dtype, pin_memory
         self._camera: tuple[tuple[int, int], Camera] | None = None
@@ -152,7 +162,7 @@ class CharacterEnv(EnvBase):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
-        self._snapshot = TensorDict(state["snapshot"], self.batch_size)
+        self._snapshot = TensorDict(state["snapshot"], self.batch_size, device=self.device)
         self.generator.set_state(state["generator"].cpu())
         self.num_diverged = state["diverged"]
 
@@ -194,22 +204,24 @@ class CharacterEnv(EnvBase):
     def _make_specs(self) -> None:
         """Derive the specs from what is observed; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
-        low, high = self._action_bounds().to(self._dtype).expand(self.num_envs, -1, -1).unbind(-1)
+        bounds = self._action_bounds().to(self.device, self._dtype)
+        low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
         self._observed = {key: value.to(self._type(value), copy=True) for key, value in self._observe(ALL).items()}
         observed = {key: self._spec(value) for key, value in self._observed.items()}
-        self.observation_spec = Composite(observed, shape=shape)
-        self.action_spec = Bounded(low, high, dtype=self._dtype)
-        self.reward_spec = Unbounded(one, dtype=self._dtype)
-        done = {key: Binary(1, shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        self.full_done_spec = Composite(done, shape=shape)
+        self.observation_spec = Composite(observed, shape=shape, device=self.device)
+        self.action_spec = Bounded(low, high, dtype=self._dtype, device=self.device)
+        self.reward_spec = Unbounded(one, dtype=self._dtype, device=self.device)
+        done = Binary(1, shape=one, dtype=torch.bool, device=self.device)
+        dones = {key: done.clone() for key in ("done", "terminated", "truncated")}
+        self.full_done_spec = Composite(dones, shape=shape, device=self.device)
 
     def _type(self, value: Tensor) -> torch.dtype:
         """Type in which something observed is emitted: flags remain flags."""
         return torch.bool if value.dtype is torch.bool else self._dtype
 
     def _spec(self, value: Tensor) -> Binary | Unbounded:
-        dtype = self._type(value)
-        return Binary(shape=value.shape, dtype=dtype) if dtype is torch.bool else Unbounded(value.shape, dtype=dtype)
+        kind = {"shape": value.shape, "dtype": self._type(value), "device": self.device}
+        return Binary(**kind) if value.dtype is torch.bool else Unbounded(**kind)
 
     def _set_seed(self, seed: int | None) -> None:
         drawn = int(torch.empty((), dtype=torch.int64).random_()) if seed is None else seed
@@ -234,9 +246,9 @@ class CharacterEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = tensordict["action"]
         expected = (self.num_envs, self.simulation.model.nu)
-        if action.shape != expected or action.device.type != "cpu":
+        if action.shape != expected or action.device.type != self.device.type:
             raise ValueError(
-                f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on the CPU, "
+                f"action has shape {tuple(action.shape)} on {action.device}: pass {expected} on {self.device}, "
                 "where the physics runs"
             )
         diverged = self.simulation.step(self._controls(action))
@@ -253,7 +265,7 @@ class CharacterEnv(EnvBase):
         if self._snapshot is not None and mask is None and not set_state:
             snapshot, self._snapshot = self._snapshot, None
             return self._reset(snapshot, set_state=True)
-        ids = torch.arange(self.num_envs) if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
+        ids = self._everybody if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
         return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
 
     def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
@@ -262,10 +274,10 @@ class CharacterEnv(EnvBase):
         if not known <= state.keys():
             state = {**self._sample(len(ids)), **state}
         self.simulation.reset(ids, {key: state[key] for key in self.simulation.state if key in state})
-        state = {"elapsed_steps": torch.zeros(len(ids), 1), **self._begin(ids), **state}
+        state = {"elapsed_steps": torch.zeros_like(self.episode["elapsed_steps"][ids]), **self._begin(ids), **state}
         for key, memory in self.episode.items():
             memory[ids] = state[key].to(memory.dtype)
-        no = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._emit(ids if len(ids) < self.num_envs else ALL, None, no, no.clone())
 
     def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:
@@ -280,7 +292,7 @@ class CharacterEnv(EnvBase):
                 raise ValueError(f"{key!r} is no part of the state: remove it; the parts are {sorted(known)}")
             if value.shape != known[key].shape:
                 raise ValueError(f"{key} has shape {tuple(value.shape)}: pass {tuple(known[key].shape)}")
-            if not (value[ids].abs() < LARGEST).all():
+            if value.dtype is not torch.bool and not (value[ids].abs() < LARGEST).all():
                 raise ValueError(f"{key} is not finite, or beyond MuJoCo's limit of {LARGEST:g}: correct it")
         return {key: value[ids] for key, value in given.items()}
 
@@ -308,7 +320,7 @@ class CharacterEnv(EnvBase):
 
     def _truncation(self) -> Tensor:
         """Whether the task cannot go on, through no fault of the character: truncates the episode, ``(N, 1)``."""
-        return torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
 
     @abstractmethod
     def _sample(self, num: int) -> dict[str, Tensor]:

@@ -23,6 +23,7 @@ class Beginnings:
         initial_states: ``"rest"``, ``"motions"``, or a weight for each: relative to their sum, how often it is drawn.
         motions: Library of motions, or clips by name; None for the character's generated motions, which are made only
             if they are drawn from.
+        device: Where states are drawn.
 
     Raises:
         ValueError: If the kinds of states or their weights are none, or the motions are of another character.
@@ -33,6 +34,7 @@ class Beginnings:
         character: str,
         initial_states: str | Mapping[str, float] = "rest",
         motions: MotionLibrary | Mapping[str, MotionClip] | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         weights = {initial_states: 1.0} if isinstance(initial_states, str) else dict(initial_states)
         total = sum(weights.values())
@@ -41,17 +43,18 @@ class Beginnings:
                 f"initial_states={initial_states!r} is unknown: pass rest, motions, or a weight of at least 0 for each"
             )
         model = character_model(character)
-        self.rest, self.num_velocities = torch.from_numpy(model.qpos0), model.nv
+        self.rest, self.num_velocities = torch.from_numpy(model.qpos0).to(device), model.nv
         self.in_motion = weights.get("motions", 0.0) / total
-        self.library = self._library(character, motions) if self.in_motion else None
+        self.library = self._library(character, motions).to(device) if self.in_motion else None
 
     def draw(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw states of the character: ``qpos``, shape ``(num, nq)``, and ``qvel``, ``(num, nv)``."""
         qpos = self.rest.repeat(num, 1)
-        qvel = torch.zeros(num, self.num_velocities, dtype=torch.float64)
+        qvel = qpos.new_zeros(num, self.num_velocities)
         if self.library is None or not num:
             return qpos, qvel
-        moving = (torch.rand(num, generator=generator) < self.in_motion).nonzero().squeeze(-1)
+        shares = torch.rand(num, device=qpos.device, generator=generator)
+        moving = (shares < self.in_motion).nonzero().squeeze(-1)
         clips, times = self.library.sample(num, generator)
         moment = self.library.at(clips, times)
         placement = placing(moment.qpos, qpos)
@@ -63,13 +66,15 @@ class Beginnings:
         """Poses that can be drawn, ``(P, nq)``: the rest pose, and motions every ``interval`` seconds."""
         if self.library is None:
             return self.rest.unsqueeze(0)
-        moments = [
+        every = [
             (clip, time)
             for clip, duration in enumerate(self.library.durations.tolist())
             for time in torch.arange(0.0, duration, interval, dtype=torch.float64).tolist()
         ]
-        clips, times = zip(*moments, strict=True)
-        poses = self.library.at(torch.tensor(clips), torch.tensor(times, dtype=torch.float64)).qpos.double()
+        clips, times = zip(*every, strict=True)
+        device = self.rest.device
+        moments = torch.tensor(clips, device=device), torch.tensor(times, dtype=torch.float64, device=device)
+        poses = self.library.at(*moments).qpos.double()
         rest = self.rest.expand(len(poses), -1)
         return torch.cat([self.rest.unsqueeze(0), placing(poses, rest).qpos(poses)])
 

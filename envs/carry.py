@@ -108,12 +108,13 @@ class Carry(Transport):
         start = super()._sample(num)
         box = start["qpos"][:, -7:]
         start["mocap_pos"][:, 1, :2] = box[:, :2]
-        turns = about_z(2 * math.pi * torch.rand(num, 2, dtype=torch.float64, generator=self.generator))
+        angles = torch.rand(num, 2, dtype=torch.float64, device=self.device, generator=self.generator)
+        turns = about_z(2 * math.pi * angles)
         box[:, 3:] = turns[:, 1]
         return {**start, "mocap_quat": turns}
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
-        return {**super()._begin(ids), "taken": torch.zeros(len(ids))}
+        return {**super()._begin(ids), "taken": torch.zeros_like(self.episode["taken"][ids])}
 
     def _rewards(self) -> Tensor:
         rewards = super()._rewards()

@@ -81,7 +81,7 @@ class Heading(TransferTask):
 
     def reach(self) -> Reach:
         """See :meth:`CharacterEnv.reach`: who is ideal walks at the target speed from the first step on."""
-        still = torch.zeros(self.num_envs, 2, dtype=torch.float64)
+        still = torch.zeros(self.num_envs, 2, dtype=torch.float64, device=self.device)
         standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
         return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))
 
@@ -101,9 +101,9 @@ class Heading(TransferTask):
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
-        tail = self._com[index] + torch.tensor([0.0, 0.0, 0.8])
-        tip = tail + torch.nn.functional.pad(unit_vector(self.episode["direction"][index]), (0, 1))
-        return [(tail.numpy(), tip.numpy())]
+        tail = self._com[index].cpu() + torch.tensor([0.0, 0.0, 0.8])
+        tip = tail + torch.nn.functional.pad(unit_vector(self.episode["direction"][index].cpu()), (0, 1))
+        return [(tail.double().numpy(), tip.numpy())]
 
 
 def unit_vector(angle: Tensor) -> Tensor:

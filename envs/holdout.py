@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import gymnasium
 import torch
@@ -33,8 +34,6 @@ class Holdout(CharacterEnv):
     Args:
         num_envs: Number N of simulations.
         directions: Range (lo, hi) of target directions in radians, counted from +x towards +y.
-        seed: Seed of ``generator``, or None to draw one.
-        num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
         max_episode_steps: Actions of 0.05 s until an episode is ``truncated``.
         contact_forces: Observe the clipped external forces on 13 bodies (78 more numbers) and pay for them, as Ant-v5
             does by default. They were always zero with the MuJoCo 2.0 of the paper's time, hence the default here. They
@@ -47,8 +46,8 @@ class Holdout(CharacterEnv):
         terminate_when_unhealthy: End the episode of an unhealthy ant.
         reset_noise_scale: Half-width of the uniform noise on the initial positions, and standard deviation of the
             normal noise on the initial velocities.
-        dtype: Type of what is emitted; physics and reward are computed in float64.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking.
+        dtype: Type of what is emitted.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.base.CharacterEnv`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -69,8 +68,6 @@ class Holdout(CharacterEnv):
         num_envs: int,
         directions: Sequence[float],
         *,
-        seed: int | None = None,
-        num_threads: int = 0,
         max_episode_steps: int = 1000,
         contact_forces: bool = False,
         forward_weight: float = 1.0,
@@ -81,7 +78,7 @@ class Holdout(CharacterEnv):
         terminate_when_unhealthy: bool = True,
         reset_noise_scale: float = 0.1,
         dtype: torch.dtype = torch.float32,
-        pin_memory: bool = False,
+        **kwargs: Any,
     ) -> None:
         directions = interval("directions", directions)
         healthy_z_range = interval("healthy_z_range", healthy_z_range)
@@ -103,11 +100,9 @@ class Holdout(CharacterEnv):
             max_episode_steps=max_episode_steps,
             episode=episode,
             outputs=["xpos"],
-            seed=seed,
-            num_threads=num_threads,
             persistent=contact_forces,
             dtype=dtype,
-            pin_memory=pin_memory,
+            **kwargs,
         )
         self.directions, self.reset_noise_scale = directions, reset_noise_scale
         self.healthy_z_range, self.terminate_when_unhealthy = healthy_z_range, terminate_when_unhealthy
@@ -119,6 +114,7 @@ class Holdout(CharacterEnv):
             contact_weight=contact_weight,
         )
         # Live views, made once. Gymnasium measures velocities with the body's xpos, one stage of RK4 before the state.
+        self._rest = torch.from_numpy(model.qpos0).to(self.device)
         qpos, self._qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
         self._height, self._posture = qpos[:, 2], qpos[:, 2:]
         self._torso = self.simulation.outputs["xpos"][:, TORSO, :2]
@@ -147,19 +143,20 @@ class Holdout(CharacterEnv):
 
     def reach(self) -> Reach:
         """See :meth:`CharacterEnv.reach`: the ideal is what Gymnasium calls solved, which is no ceiling."""
-        still = torch.zeros(self.num_envs, 2)
-        action, healthy = torch.zeros(self.num_envs, self.simulation.model.nu), torch.ones(self.num_envs)
+        still = torch.zeros(self.num_envs, 2, device=self.device)
+        action, healthy = torch.zeros_like(self.simulation.state["ctrl"]), torch.ones_like(still[:, 0])
         standing = self.max_episode_steps * self._reward(still, self.episode["goal"], action, healthy)
         return Reach(standing, torch.full_like(standing, self._solved()))
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         model, noise, source = self.simulation.model, self.reset_noise_scale, self.generator
-        angle = torch.empty(num, 1, dtype=torch.float64).uniform_(*self.directions, generator=source)
-        shift = torch.empty(num, model.nq, dtype=torch.float64).uniform_(-noise, noise, generator=source)
+        blank = partial(torch.empty, dtype=torch.float64, device=self.device)
+        angle = blank(num, 1).uniform_(*self.directions, generator=source)
+        shift = blank(num, model.nq).uniform_(-noise, noise, generator=source)
         return {
             "goal": torch.cat([angle.cos(), angle.sin()], -1),
-            "qpos": torch.from_numpy(model.qpos0) + shift,
-            "qvel": torch.empty(num, model.nv, dtype=torch.float64).normal_(0.0, noise, generator=source),
+            "qpos": self._rest + shift,
+            "qvel": blank(num, model.nv).normal_(0.0, noise, generator=source),
         }
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
@@ -189,6 +186,6 @@ class Holdout(CharacterEnv):
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
-        tail = self.simulation.state["qpos"][index, :3] + torch.tensor([0.0, 0.0, 0.6])
-        tip = tail + torch.nn.functional.pad(self.episode["goal"][index], (0, 1))
-        return [(tail.numpy(), tip.double().numpy())]
+        tail = self.simulation.state["qpos"][index, :3].cpu() + torch.tensor([0.0, 0.0, 0.6])
+        tip = tail + torch.nn.functional.pad(self.episode["goal"][index].cpu(), (0, 1))
+        return [(tail.double().numpy(), tip.double().numpy())]

@@ -123,14 +123,12 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"switch_to={switch_to!r} is unknown: pass 'any' or 'same'")
         if clip_end not in ("truncate", "switch"):
             raise ValueError(f"clip_end={clip_end!r} is unknown: pass 'truncate' or 'switch'")
-        self.library, self.max_error, self.clip_end = library, max_error, clip_end
+        self.max_error, self.clip_end = max_error, clip_end
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         self.failure_weighting = failure_weighting
-        self._sampler = AdaptiveSampler(library)
-        self._layout, names = joint_layout(character), library.body_names
-        self._keys = [names.index(body) for body in CHARACTERS[character].key_bodies]
+        names = library.body_names
         reference = {
             "clip": torch.zeros((), dtype=torch.int64),
             "time": torch.zeros((), dtype=torch.float64),
@@ -140,6 +138,15 @@ class Imitation(PDCharacterEnv):
             "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
         super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
+        self.library, self._layout = library.to(self.device), joint_layout(character).to(self.device)
+        self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
+        ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
+        self._ahead = ahead.unsqueeze(-1).to(self.device)
+        self._horizontal = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device=self.device)
+        self._sampler = AdaptiveSampler(self.library)
+        model, own = self.simulation.model, slice(1, 1 + len(self._bodies))
+        masses, centres = (torch.from_numpy(field[own]) for field in (model.body_mass, model.body_ipos))
+        self._masses, self._centres_of_mass = masses.to(self.device), centres.to(self.device)
         self._make_specs()
         for name in self.terms:
             self._error(name, self._next)
@@ -161,7 +168,7 @@ class Imitation(PDCharacterEnv):
             times: Seconds since its first frame, shape ``(n,)``, float64.
         """
         num, moment = len(clips), self.library.at(clips, times)
-        turn, shift = torch.zeros(num, dtype=torch.float64), -moment.qpos[:, :2]
+        turn, shift = torch.zeros_like(times), -moment.qpos[:, :2]
         return {
             "qpos": torch.cat([torch.zeros_like(shift), moment.qpos[:, 2:]], -1),
             "qvel": moment.qvel,
@@ -169,8 +176,8 @@ class Imitation(PDCharacterEnv):
             "time": times,
             "turn": turn,
             "shift": shift,
-            "error": torch.zeros(num, dtype=torch.float64),
-            "terms": torch.zeros(num, len(self.terms), dtype=torch.float64),
+            "error": torch.zeros_like(times),
+            "terms": times.new_zeros(num, len(self.terms)),
         }
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -198,11 +205,12 @@ class Imitation(PDCharacterEnv):
     def _draw(self, num: int, clips: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Draw moments, of the clips if these are given."""
         if clips is not None:
-            return clips, torch.rand(num, generator=self.generator, dtype=torch.float64) * self.library.durations[clips]
+            shares = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
+            return clips, shares * self.library.durations[clips]
         clips, times = self.library.sample(num, self.generator)
         if not self.failure_weighting:
             return clips, times
-        hard = torch.rand(num, generator=self.generator) < self.failure_weighting
+        hard = torch.rand(num, generator=self.generator, device=self.device) < self.failure_weighting
         others = self._sampler.draw(num, self.generator)
         return torch.where(hard, others[0], clips), torch.where(hard, others[1], times)
 
@@ -214,7 +222,7 @@ class Imitation(PDCharacterEnv):
         targets = self._look_ahead(ids)
         placement = cast("Placement", targets.placement)
         # Seen from the character, a reference looks as its clip does from where it would be there.
-        ground = place * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
+        ground = place * self._horizontal
         origin = placement.inverse().points(ground.repeat(NUM_TARGETS, 1))
         turn = angle.repeat(NUM_TARGETS) - placement.turn
         dtype = targets.moment.qpos.dtype
@@ -229,8 +237,7 @@ class Imitation(PDCharacterEnv):
     def _look_ahead(self, ids: Tensor | slice) -> PlacedMotion:
         """The references of n simulations in the next steps, one step after the other, ``(NUM_TARGETS * n, ...)``."""
         clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
-        num, steps = len(clip), torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
-        times = (time + CONTROL_TIMESTEP * steps.unsqueeze(-1)).flatten()
+        num, times = len(clip), (time + self._ahead).flatten()
         placement = Placement(turn.repeat(NUM_TARGETS), shift.repeat(NUM_TARGETS, 1))
         targets = self.library.at(clip.repeat(NUM_TARGETS), times, placement)
         first = targets[:num]
@@ -252,7 +259,7 @@ class Imitation(PDCharacterEnv):
 
     def _switch(self) -> None:
         """Give some characters another reference, like what they do, where they are and facing as they do."""
-        changes = torch.rand(self.num_envs, generator=self.generator) < self.switch_probability
+        changes = torch.rand(self.num_envs, generator=self.generator, device=self.device) < self.switch_probability
         if self.clip_end == "switch":
             changes |= self._ended()
         ids = changes.nonzero().squeeze(-1)
@@ -263,10 +270,10 @@ class Imitation(PDCharacterEnv):
         moments = self.library.at(clips, times)
         placement = placing(moments.qpos, self.simulation.state["qpos"][each])
         best = mismatch(self._body_states(each), moments.carried(placement).bodies).view(-1, len(ids)).argmin(0)
-        chosen = best * len(ids) + torch.arange(len(ids))
+        chosen = best * len(ids) + self._everybody[: len(ids)]
         changed = {"clip": clips, "time": times, "turn": placement.turn, "shift": placement.shift}
         for key, values in changed.items():
-            self.episode[key][ids] = values[chosen]
+            self.episode[key][ids] = values[chosen].to(self.episode[key].dtype)
 
     def _error(self, name: str, reference: PlacedMotion) -> Tensor:
         """How far the character is from the reference in one respect, one of ``ERRORS``, ``(N,)``."""
@@ -299,10 +306,8 @@ class Imitation(PDCharacterEnv):
 
     def _centre_of_mass(self, reference: PlacedMotion) -> Tensor:
         """Of the character, if its bodies were there, ``(N, 3)``."""
-        model, count = self.simulation.model, reference.positions.shape[-2]
-        masses, centres = (torch.from_numpy(field[1 : 1 + count]) for field in (model.body_mass, model.body_ipos))
-        places = reference.positions + rotate(reference.orientations, centres)
-        return masses @ places / masses.sum()
+        places = reference.positions + rotate(reference.orientations, self._centres_of_mass)
+        return self._masses @ places / self._masses.sum()
 
     def _truncation(self) -> Tensor:
         return (self._ended() & (self.clip_end == "truncate")).unsqueeze(-1)

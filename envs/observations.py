@@ -1,7 +1,7 @@
 """The observation of a character's own state, as functions of arrays.
 
 They run right after the physics, which leaves nothing in the cache: there an operation of NumPy takes a third of one of
-torch. So they work on arrays, component by component, with the simulations side by side: ``(L, 13, n)``.
+torch. So on the CPU they work on arrays, component by component, with the simulations side by side: ``(L, 13, n)``.
 """
 
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.rotations import about_z, multiply, rotate
 
 SIZES = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
 """What is seen of a body, in this order: 13 numbers."""
@@ -30,6 +31,8 @@ def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -
     Returns:
         Shape ``(*B, 13 L)``.
     """
+    if not angle.is_cpu:
+        return _elsewhere(angle, origin, bodies)
     seen = _seen(angle, origin, bodies)
     return _rows(seen.reshape(-1, seen.shape[-1]), angle)
 
@@ -52,6 +55,8 @@ def character_state(angle: Tensor, bodies: BodyStates) -> Tensor:
         section 5.1 and table 3, https://arxiv.org/abs/1905.09808
     """
     root = bodies.positions[..., 0, :]
+    if not angle.is_cpu:
+        return torch.cat([root[..., 2:], _elsewhere(angle, root, bodies)], -1)
     seen = _seen(angle, root, bodies)
     height = root[..., 2].reshape(1, -1).numpy()
     return _rows(np.concatenate([height, seen.reshape(-1, seen.shape[-1])]), angle)
@@ -81,6 +86,19 @@ def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
     np.subtract(positions[:, 2], place[:, 2], out=seen[:, 2])
     seen[:, 9], seen[:, 12] = linear[:, 2], angular[:, 2]
     return seen
+
+
+def _elsewhere(angle: Tensor, origin: Tensor, bodies: BodyStates) -> Tensor:
+    """Return :func:`bodies_in_heading_frame` on other devices than the CPU."""
+    turn = about_z(-angle).unsqueeze(-2)
+    orientations = multiply(turn, bodies.orientations)
+    parts = [
+        rotate(turn, bodies.positions - origin.unsqueeze(-2)),
+        torch.where(orientations[..., :1] < 0, -orientations, orientations),
+        rotate(turn, bodies.linear_velocities),
+        rotate(turn, bodies.angular_velocities),
+    ]
+    return torch.cat(parts, -1).flatten(-2)
 
 
 def _planes(field: Tensor) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Characters under PD control: their state, falls and scene, which all their tasks share."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import mujoco
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.arrays import as_array, as_tensor
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.mirror import Mirror, mirror_actions, mirror_state
@@ -86,8 +87,6 @@ class PDCharacterEnv(CharacterEnv):
                 "divided by a whole number, such as 1/120"
             )
         model = spec.compile()
-        self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5])
-        self._falling = [part.numpy() for part in falling_geoms(model, self.character.feet, len(self._bodies))]
         super().__init__(
             model,
             num_envs,
@@ -100,16 +99,21 @@ class PDCharacterEnv(CharacterEnv):
             **kwargs,
         )
         self.terminate_on_fall = terminate_on_fall
+        self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5]).to(self.device)
+        self._rest = torch.from_numpy(model.qpos0).to(self.device)
+        shapes = falling_geoms(model, self.character.feet, len(self._bodies))
+        self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
         """Where to find each quantity in ``observation``, by name."""
         # Live views, made once. The character's bodies follow the world, which is body 0.
         bodies, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
         self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
         self._com = outputs["subtree_com"][:, 1]
-        self._geom_heights = outputs["geom_xpos"].numpy()[..., 2]
+        self._geom_heights = as_array(outputs["geom_xpos"])[..., 2]
         # Rows by numbers, component by component: several times as fast as the rows of matrices.
-        self._geom_axes = outputs["geom_xmat"].numpy().reshape(num_envs, -1)
-        self._vertical_columns = (9 * self._falling[0] + [[6], [7], [8]]).flatten()
+        self._geom_axes = as_array(outputs["geom_xmat"]).reshape(num_envs, -1)
+        axes = torch.tensor([[6], [7], [8]])
+        self._vertical_columns = as_array((9 * shapes[0] + axes).flatten().to(self.device))
         self._array_type = torch.empty(0, dtype=self._dtype).numpy().dtype
         self._look_at(bodies)
 
@@ -138,7 +142,7 @@ class PDCharacterEnv(CharacterEnv):
         """Whether a body other than the feet touches the ground, shape ``(N,)``, bool."""
         heights, half_sizes, radii = self._geom_heights[:, self._falling[0]], *self._falling[1:]
         vertical = self._geom_axes[:, self._vertical_columns].reshape(len(heights), 3, -1).swapaxes(1, 2)
-        return torch.from_numpy((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
+        return as_tensor((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
 
     def _com_velocity(self) -> Tensor:
         """Horizontal displacement of the centre of mass in the step just made, per second, ``(N, 2)``."""
@@ -153,16 +157,18 @@ class PDCharacterEnv(CharacterEnv):
 
     def _look_at(self, bodies: slice) -> None:
         """Choose the bodies that are observed: one tree, or several with a body each."""
-        outputs = {key: value.numpy() for key, value in self.simulation.outputs.items()}
+        outputs = {key: as_array(value) for key, value in self.simulation.outputs.items()}
         self._bodies_seen = [outputs[key][:, bodies] for key in ("xpos", "xquat", "cvel")]
-        trees = self.simulation.model.body_rootid[bodies]
-        self._centres = outputs["subtree_com"], trees if len(set(trees)) > 1 else trees[:1]
+        trees = torch.from_numpy(self.simulation.model.body_rootid[bodies]).to(self.device)
+        self._centres = outputs["subtree_com"], as_array(trees if len(trees.unique()) > 1 else trees[:1])
 
     def _body_states(self, ids: Tensor | slice) -> BodyStates:
         """The observed bodies in the world, in ``dtype``; stored component by component, which is faster to work on."""
-        rows = ids if isinstance(ids, slice) else ids.numpy()
-        positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._bodies_seen)
+        rows = ids if isinstance(ids, slice) else as_array(ids)
         centres, trees = self._centres
+        if self.device.type != "cpu":
+            return body_states([part[rows] for part in self._bodies_seen], centres[rows][:, trees], self._dtype)
+        positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._bodies_seen)
         arms = np.subtract(positions, centres[rows][:, trees].transpose(1, 2, 0), order="C")
         angular, linear = np.ascontiguousarray(twists[:, :3]), twists[:, 3:]
         # MuJoCo gives the velocity of the point of each body that passes the centre of mass of its tree.
@@ -175,18 +181,32 @@ class PDCharacterEnv(CharacterEnv):
         return character_state(angle.to(self._dtype), self._body_states(ids))
 
     def _action_bounds(self) -> Tensor:
-        return torch.tensor([-1.0, 1.0]).expand(len(self._scale), 2)
+        return torch.tensor([-1.0, 1.0]).expand(self.simulation.model.nu, 2)
 
     def _controls(self, action: Tensor) -> Tensor:
         return action * self._scale
 
     def _sample(self, num: int) -> dict[str, Tensor]:
-        model = self.simulation.model
-        qpos = torch.from_numpy(model.qpos0).repeat(num, 1)
-        return {"qpos": qpos, "qvel": torch.zeros(num, model.nv, dtype=torch.float64)}
+        qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
+        return {"qpos": self._rest.repeat(num, 1), "qvel": qvel}
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {"com": self._com[ids]}
+
+
+def body_states(parts: Sequence[Tensor], centres: Tensor, dtype: torch.dtype) -> BodyStates:
+    """What MuJoCo computes of bodies as their states in the world.
+
+    Args:
+        parts: ``xpos``, ``xquat`` and ``cvel`` of L bodies, each ``(n, L, ...)``.
+        centres: Centre of mass of the tree of each, ``(n, L, 3)``, or of the only one, ``(n, 1, 3)``.
+        dtype: Of the states.
+    """
+    positions, orientations, twists = parts
+    angular, linear = twists.split(3, -1)
+    # MuJoCo gives the velocity of the point of each body that passes the centre of mass of its tree.
+    linear = linear + torch.linalg.cross(angular, positions - centres)
+    return BodyStates(*(part.to(dtype) for part in (positions, orientations, linear, angular)))
 
 
 def add_ground(spec: mujoco.MjSpec) -> None:

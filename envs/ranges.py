@@ -1,7 +1,7 @@
 """What a task draws evenly for each episode, and mixtures of ranges to draw from."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -47,8 +47,14 @@ class Ranges:
         draws = max(num, 1)  # multinomial draws no empty sample
         chosen = torch.multinomial(self._weights, draws, replacement=True, generator=generator)[:num]
         low, high = self._bounds[chosen].unbind(-1)
-        drawn = low + (high - low) * torch.rand(low.shape, dtype=torch.float64, generator=generator)
+        shares = torch.rand(low.shape, dtype=torch.float64, device=low.device, generator=generator)
+        drawn = low + (high - low) * shares
         return dict(zip(self._names, drawn.unbind(-1), strict=True))
+
+    def to(self, device: torch.device) -> Self:
+        """Draw on a device from now on, where the generator must be, and return these ranges."""
+        self._bounds, self._weights = self._bounds.to(device), self._weights.to(device)
+        return self
 
     def require_distances(self, *names: str) -> None:
         """Check that ranges are of distances, which are not negative.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -123,7 +123,13 @@ def transport_reward(
     missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
     (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
     exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
-    return exponents.exp() @ exponents.new_tensor(weights)
+    return exponents.exp() @ _on(exponents.device, tuple(weights)).to(exponents.dtype)
+
+
+@cache
+def _on(device: torch.device, numbers: tuple[float, ...]) -> Tensor:
+    """Numbers on a device, brought there once, float64."""
+    return torch.tensor(numbers, dtype=torch.float64, device=device)
 
 
 def idle_reward(weights: Sequence[float], speed: float) -> float:

@@ -89,7 +89,8 @@ class TransferTask(PDCharacterEnv):
         names = [*(["potential"] if ramps else []), *([TASK_REWARD] if self._practised else [])]
         remembered = {name: torch.zeros((), dtype=torch.float64) for name in names}
         super().__init__(character, num_envs, episode={**remembered, **episode}, **kwargs)
-        self.beginnings = Beginnings(character, initial_states, motions)
+        self.ranges.to(self.device)
+        self.beginnings = Beginnings(character, initial_states, motions, self.device)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         start = super()._sample(num)
@@ -100,7 +101,7 @@ class TransferTask(PDCharacterEnv):
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         begun = super()._begin(ids)
         if self._practised:
-            begun[TASK_REWARD] = torch.zeros(len(ids))
+            begun[TASK_REWARD] = torch.zeros_like(self.episode[TASK_REWARD][ids])
         if self.shaping:
             begun["potential"] = self._potential(ids)
         if self.staggered and len(ids) == self.num_envs:

@@ -128,6 +128,7 @@ class Transport(TransferTask):
         self._things = BodyStates(outputs["xpos"][:, rows], outputs["xquat"][:, rows], linear, angular)
         self._look_at(slice(1, None))  # seen together, they take little longer than the character alone
         self._target, self._object = self._things.positions[:, 0], self._things.positions[:, -1]
+        self._marks = mocap_positions(self.simulation.model).to(self.device)
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
@@ -166,7 +167,7 @@ class Transport(TransferTask):
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         start, drawn = super()._sample(num), self.ranges.draw(num, self.generator)
-        marks = mocap_positions(self.simulation.model).repeat(num, 1, 1)
+        marks = self._marks.repeat(num, 1, 1)
         directions = drawn["object_directions"], drawn["object_directions"] + drawn["target_directions"]
         place = start["qpos"][:, :2] + steps(drawn["object_distances"], directions[0])
         start["qpos"][:, -7:-5] = place
@@ -257,7 +258,7 @@ def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low
     """
     data, radius = mujoco.MjData(model), 0.0
     own = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0))
-    for pose in poses.numpy():
+    for pose in poses.cpu().numpy():
         data.qpos[: len(pose)] = pose
         mujoco.mj_kinematics(model, data)
         half_sizes = np.einsum("gij,gj->gi", np.abs(data.geom_xmat[own].reshape(-1, 3, 3)), model.geom_aabb[own, 3:])
@@ -270,6 +271,7 @@ def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low
 
 def pointer(tail: Tensor, tip: Tensor) -> Arrow:
     """A horizontal arrow above ``tail``, towards ``tip`` and at most 1 m long."""
+    tail, tip = tail.double().cpu(), tip.double().cpu()
     way = (tip - tail) * torch.tensor([1.0, 1.0, 0.0])
     start = tail + torch.tensor([0.0, 0.0, 0.8])
     return start.numpy(), (start + way / way.norm().clamp_min(1.0)).numpy()

@@ -1,7 +1,8 @@
 """Where a character's joints are in MuJoCo's ``qpos`` and ``qvel``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import mujoco
 import torch
@@ -47,6 +48,13 @@ class JointLayout:
     rates: Tensor
     mirror: Tensor
     mirror_sign: Tensor
+
+    def to(self, device: torch.device) -> "JointLayout":
+        """Return the layout with its indices on a device."""
+        moved: dict[str, Any] = {
+            key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
 
 
 @cache

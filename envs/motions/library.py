@@ -1,5 +1,6 @@
 """Many motion clips, looked up in one batch."""
 
+import copy
 import hashlib
 from collections.abc import Mapping
 from functools import cached_property
@@ -144,6 +145,17 @@ class MotionLibrary:
     def __len__(self) -> int:
         return len(self.names)
 
+    def to(self, device: torch.device | str) -> "MotionLibrary":
+        """Return the library on a device, itself if it is there."""
+        if self._table.device == torch.device(device):
+            return self
+        moved = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(moved, name, value.to(device))
+        moved._cycles = Placement(*(part.to(device) for part in self._cycles))
+        return moved
+
     def at(self, clips: Tensor, times: Tensor, placement: Placement | None = None) -> PlacedMotion:
         """Read moments of clips.
 
@@ -184,7 +196,8 @@ class MotionLibrary:
         """
         weights = self.weights if weights is None else weights
         clips = torch.multinomial(weights, num, replacement=True, generator=generator)
-        return clips, torch.rand(num, generator=generator, dtype=torch.float64) * self.durations[clips]
+        durations = self.durations[clips]
+        return clips, torch.rand(num, generator=generator, dtype=torch.float64, device=durations.device) * durations
 
     def _checked(self, weights: Mapping[str, float]) -> Tensor:
         if set(weights) != set(self.names):

@@ -117,7 +117,7 @@ def count_by_section():
 
     for label, (owner, name) in SECTIONS.items():
         watch(owner, name, label)
-    PretendTensor.on_wait = staticmethod(lambda: waits.update([section[0]]))
+    PretendTensor.on_wait = staticmethod(lambda operation: waits.update([section[0]]))
     return waits
 
 

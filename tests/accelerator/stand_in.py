@@ -38,11 +38,11 @@ class Module(_DummyBackendModule):
 class PretendTensor(torch.Tensor):
     """A tensor on the device, with its numbers in ``held``.
 
-    ``on_wait`` is called whenever the processor would have to wait for the device.
+    ``on_wait`` is called with the operation whenever the processor would have to wait for the device.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl
-    on_wait = staticmethod(lambda: None)
+    on_wait = staticmethod(lambda operation: None)
 
     @staticmethod
     def __new__(cls, held):
@@ -65,7 +65,9 @@ class PretendTensor(torch.Tensor):
     def tolist(self):
         return self.cpu().tolist()
 
-    def to(self, *args, **kwargs):
+    def to(self, *args, copy=False, **kwargs):
+        if copy:
+            return self.clone().to(*args, **kwargs)
         device, dtype, *_ = torch._C._nn._parse_to(*args, **kwargs)
         if device is not None and device.type == "meta":
             return self.held.to(*args, **kwargs)
@@ -101,7 +103,7 @@ def dispatch(operation, args, kwargs):
     if operation is aten.copy_.default:
         arrives = isinstance(args[0], PretendTensor)
     if operation.overloadpacket in WAITS or (copies and not arrives) or picks_by_mask(operation, args):
-        PretendTensor.on_wait()
+        PretendTensor.on_wait(operation)
     if kwargs.get("device") is not None:
         kwargs["device"] = torch.device("cpu")
     changed = {id(tensor.held): tensor for tensor in tensors if isinstance(tensor, PretendTensor)}

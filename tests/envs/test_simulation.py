@@ -5,8 +5,8 @@ import mujoco
 import pytest
 import torch
 
+from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.characters import ant
-from torchrl_mcp.envs.simulation import Simulation
 
 # With so small an arena MuJoCo raises an error as soon as the box touches the floor.
 FRAGILE = """
@@ -28,7 +28,7 @@ def _log_elsewhere(tmp_path, monkeypatch):
 
 @pytest.fixture
 def ants():
-    simulation = Simulation(ant().compile(), 4, substeps=5, outputs=["xpos"], num_threads=1)
+    simulation = BatchSimulation(ant().compile(), 4, substeps=5, outputs=["xpos"], num_threads=1)
     simulation.reset(torch.arange(4), {})
     return simulation
 
@@ -69,7 +69,7 @@ def test_a_reset_leaves_the_neighbours_alone(ants):
 
 @pytest.mark.parametrize("speed", [1e4, 1e8, 9e9])
 def test_a_diverging_simulation_keeps_its_state_and_harms_no_other(ants, speed):
-    twin = Simulation(ant().compile(), 4, substeps=5, outputs=["xpos"], num_threads=1)
+    twin = BatchSimulation(ant().compile(), 4, substeps=5, outputs=["xpos"], num_threads=1)
     twin.reset(torch.arange(4), {})
     ants.state["qvel"][1] = speed
     before, ctrl = copied(ants.state), torch.rand(4, 8)
@@ -92,7 +92,7 @@ def test_a_control_without_meaning_is_a_fault(ants, number):
 
 def test_an_error_inside_mujoco_is_a_fault_of_that_simulation():
     model = mujoco.MjModel.from_xml_string(FRAGILE)
-    simulation = Simulation(model, 3, substeps=2, outputs=["xpos"], num_threads=1)
+    simulation = BatchSimulation(model, 3, substeps=2, outputs=["xpos"], num_threads=1)
     simulation.reset(torch.arange(3), {})
     simulation.state["qpos"][1, 2] = 0.05
     assert simulation.step(torch.zeros(3, 1)).tolist() == [1]
@@ -102,7 +102,7 @@ def test_an_error_inside_mujoco_is_a_fault_of_that_simulation():
 
 
 def test_a_state_that_mujoco_cannot_compute_is_refused():
-    simulation = Simulation(mujoco.MjModel.from_xml_string(FRAGILE), 3, substeps=2, num_threads=1)
+    simulation = BatchSimulation(mujoco.MjModel.from_xml_string(FRAGILE), 3, substeps=2, num_threads=1)
     touching = torch.tensor([[0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]])
     with pytest.raises(ValueError, match="simulation 2"):
         simulation.reset(torch.tensor([2]), {"qpos": touching})
@@ -110,7 +110,7 @@ def test_a_state_that_mujoco_cannot_compute_is_refused():
 
 def test_the_given_model_is_left_as_it_is():
     model = ant().compile()
-    Simulation(model, 1, substeps=1, num_threads=1)
+    BatchSimulation(model, 1, substeps=1, num_threads=1)
     assert model.opt.disableflags == ant().compile().opt.disableflags
 
 

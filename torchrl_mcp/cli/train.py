@@ -21,6 +21,7 @@ SETTINGS = {
     "resume=FOLDER": "run folder to continue, alone",
     "training.total_frames=N": "environment steps",
     "device=cuda": "networks on a GPU; physics stays on the CPU",
+    "physics=warp": "with device=cuda, physics on the GPU as well, by the extra torchrl-mcp[warp]",
 }
 
 EXAMPLES = f"""\

@@ -65,9 +65,9 @@ def evaluate(
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     state = env.reset() if start is None else env.reset(start, set_state=True)
     reach = env.reach() if hasattr(env, "reach") else None
-    running = torch.ones(env.batch_size, dtype=torch.bool)
-    returns = torch.zeros(env.batch_size)
-    lengths = torch.zeros(env.batch_size, dtype=torch.int64)
+    running = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
+    returns = torch.zeros(env.batch_size, device=env.device)
+    lengths = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
     terminated = torch.zeros_like(running)
     positions: list[Tensor] = []
     decisions: list[TensorDictBase] = []

@@ -72,7 +72,7 @@ class OptionMemory(Transform):
         if mask is not None:
             self._held = {key: value.masked_fill(mask.squeeze(-1), 0) for key, value in self._held.items()}
         elif not self._restored:
-            nothing = torch.zeros(tensordict_reset.batch_size, dtype=torch.int64)
+            nothing = torch.zeros(tensordict_reset.batch_size, dtype=torch.int64, device=tensordict_reset.device)
             self._held = {"held_option": nothing, "held_steps": nothing}
         self._restored = False
         return tensordict_reset.update(self.get_extra_state())

@@ -25,6 +25,7 @@ from torchrl.envs import Compose
 from torchrl.record.loggers.common import Logger
 
 from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs.engines import require_engine
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
@@ -97,6 +98,10 @@ def require_equipment(cfg: DictConfig) -> None:
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
             "build of torch on a machine with a GPU"
         )
+    if _on_device(cfg):
+        require_engine(cfg.physics, torch.device(cfg.device))
+        if "num_workers" in cfg.collector:
+            raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
     kind = cfg.logger.logger_type if cfg.logger else "csv"
     if kind != "csv" and find_spec(kind) is None:
         raise ValueError(f"logger={kind} needs {kind}: pip install 'torchrl-mcp[{kind}]', or choose logger=tensorboard")
@@ -171,8 +176,10 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
 
 def make_source(cfg: DictConfig) -> TrajectorySource:
     """Return where trajectories come from."""
-    pin_memory = torch.device(cfg.device).type == "cuda"
-    factory = partial(make_env, cfg, pin_memory=pin_memory)
+    if _on_device(cfg):
+        factory = partial(make_env, cfg, physics=cfg.physics, device=cfg.device)
+    else:
+        factory = partial(make_env, cfg, pin_memory=torch.device(cfg.device).type == "cuda")
     return instantiate(cfg.collector)(factory, num_envs=cfg.training.num_envs, seed=cfg.seed)
 
 
@@ -278,6 +285,11 @@ def _import(module: str, character: str) -> None:
             f"character={character} is in the module {module}, which Python does not find: call from the folder of "
             f"{module}.py, or add that to PYTHONPATH"
         ) from error
+
+
+def _on_device(cfg: DictConfig) -> bool:
+    """Tell whether training episodes are simulated where the networks are; older runs, which do not say, are not."""
+    return cfg.get("physics") == "warp"
 
 
 def _exists(name: str) -> bool:

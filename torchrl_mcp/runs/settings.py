@@ -99,6 +99,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     _among(True, False, "auto"): "autocast",
     _among("any", "same"): "switch_to",
     _among("pyramidal", "elliptic"): "friction_cone",
+    _among("mujoco", "warp"): "physics",
 }
 
 RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}

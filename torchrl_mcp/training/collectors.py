@@ -106,7 +106,7 @@ class LocalSource:
             policy,
             frames_per_batch=frames_per_batch,
             total_frames=-1,
-            env_device="cpu",
+            env_device=self.env.device,
             policy_device=device,
             storing_device=device,
             auto_register_policy_transforms=False,

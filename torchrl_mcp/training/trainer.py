@@ -66,7 +66,7 @@ class Trainer:
         max_grad_norm: Largest gradient norm, of actor and critic each, or None to leave gradients as they are.
         step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
         autocast: Run all networks in bfloat16 autocast, in source and loss alike.
-        device: Where the networks are; physics stays on the CPU.
+        device: Where the networks are.
         checkpoint_interval: Iterations between checkpoints.
         progress_bar: Show the progress on standard error.
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.simulation import Simulation
 
 BALL, HINGE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE
 
@@ -103,7 +103,7 @@ def test_the_biped_withstands_a_push(push, scene):
 @pytest.mark.parametrize("height", [0.0, 1.0])
 def test_random_actions_do_not_make_it_diverge(character, height, scene):
     model = scene(character)
-    simulation = Simulation(model, 32, substeps=4, num_threads=1)
+    simulation = BatchSimulation(model, 32, substeps=4, num_threads=1)
     qpos = torch.tensor(model.qpos0).repeat(32, 1)
     qpos[:, 2] += height
     simulation.reset(torch.arange(32), {"qpos": qpos})
