@@ -52,12 +52,9 @@ def pictures(clip: MotionClip, times: Tensor, *, size: int, follow_heading: bool
 
 
 def _scene(character: str) -> mujoco.MjModel:
-    """A character on the ground below a pale sky."""
+    """A character on the ground below a sky."""
     spec = CHARACTERS[character].spec()
     add_ground(spec)
-    texture, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
-    pale = {"rgb1": [0.95, 0.97, 1.0], "rgb2": [0.80, 0.86, 0.92]}
-    spec.add_texture(name="sky", type=texture, builtin=gradient, width=64, height=64, **pale)
     spec.visual.quality.shadowsize = 2048
     return spec.compile()
 
