@@ -142,7 +142,7 @@ class Transport(TransferTask):
         return mirror_signs([sign for size in self._shown.values() for sign in BODY_SIGNS[:size]])
 
     def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`."""
+        """Returns of standing still, and of an ideal player who takes the object straight to its target."""
 
         def reward(*state: Tensor) -> Tensor:
             left = torch.linalg.vector_norm(state[2] - state[4], dim=-1)
