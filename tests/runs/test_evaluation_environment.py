@@ -23,6 +23,8 @@ NO_SETTINGS = {
     "motions",
     "seed",
     "num_threads",
+    "physics",  # evaluations are always of MuJoCo on the CPU
+    "device",
     "dtype",
     "pin_memory",
     "kwargs",
