@@ -1,3 +1,5 @@
+from importlib.util import find_spec
+
 import pytest
 import torch
 
@@ -39,3 +41,6 @@ def actions():
     return lambda env, num, scale=0.3, seed=1: (
         scale * (2 * torch.rand(num, *env.action_spec.shape, generator=torch.Generator().manual_seed(seed)) - 1)
     )
+
+
+collect_ignore = [] if find_spec("mujoco_warp") else ["test_simulation.py", "test_parity.py"]
