@@ -1,4 +1,4 @@
-"""The adaptive sampler of reference motions, which prefers moments where episodes end."""
+"""An adaptive sampler of reference motions, which prefers moments at which episodes end."""
 
 import torch
 from torch import Tensor
@@ -6,22 +6,22 @@ from torch import Tensor
 from torchrl_mcp.envs.motions.library import MotionLibrary
 
 PERIOD = 1.0
-"""Seconds of a clip that are counted together, and how long before a failure an attempt to avoid it may begin."""
+"""Length in seconds of the periods of a clip that are counted, and longest lead before a failure."""
 
 DECAY = 0.9997
-"""Share of the counts that remains after a control step: they reach back about 100 s."""
+"""Share of the counts that remains after a control step: they cover about the last 100 s."""
 
 PRIOR_STEPS, PRIOR_FAILURES = 100.0, 1.0
-"""What every period is taken to have seen before anything was counted."""
+"""Initial counts of every period."""
 
 
 class AdaptiveSampler:
-    r"""A sampler of moments in reference motions, weighted by how often references are lost there.
+    r"""Draws moments of reference motions, weighted by how often episodes end there.
 
     .. math:: P(j) \propto W_j \lambda_j
 
-    where :math:`\lambda_j` is the recent share of the steps in period j that ended an episode, and :math:`W_j` how
-    often the library draws the period. A moment is drawn evenly from the period and the second before it.
+    where :math:`\lambda_j` is the recent share of steps in period j that ended an episode, and :math:`W_j` the
+    probability with which the library draws the period. A moment is uniform over the period and the second before it.
 
     Args:
         library: The reference motions.
@@ -39,11 +39,11 @@ class AdaptiveSampler:
         self.failures = torch.full_like(self._weights, PRIOR_FAILURES)
 
     def count(self, clips: Tensor, times: Tensor, failed: Tensor) -> None:
-        """Count a step of N simulations, and let old ones fade.
+        """Count a step of N simulations, and decay the counts of earlier steps.
 
         Args:
-            clips: Index of the clip that each followed, shape ``(N,)``.
-            times: Seconds since its first frame, shape ``(N,)``.
+            clips: Index of the clip of each simulation, shape ``(N,)``.
+            times: Seconds since the clip's first frame, shape ``(N,)``.
             failed: Whether the step ended the episode, shape ``(N,)``, bool.
         """
         durations = self._durations[clips]
@@ -68,5 +68,5 @@ class AdaptiveSampler:
         return {"steps": self.steps, "failures": self.failures}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.steps, self.failures = (state[name].to(self.steps.device, copy=True) for name in ("steps", "failures"))

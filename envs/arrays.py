@@ -1,7 +1,7 @@
-"""Arrays in place of tensors, for what runs right after the physics.
+"""Arrays in place of tensors, for code that runs right after the physics.
 
-On the CPU, where the physics leaves nothing in the cache, an operation of NumPy takes a third of one of torch. On
-other devices tensors are their own arrays.
+On the CPU, where the physics evicts the caches, an operation takes NumPy a third of torch's time. On other
+devices :data:`Array` is a tensor.
 """
 
 from typing import Any
@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 Array = Any
-"""An ``np.ndarray`` in place of a tensor on the CPU, or else a tensor."""
+"""An ``np.ndarray`` on the CPU, a tensor on other devices."""
 
 
 def as_array(tensor: Tensor) -> Array:
-    """Return a view of a tensor."""
+    """Return a view of a tensor as an array."""
     return tensor.numpy() if tensor.is_cpu else tensor
 
 
 def as_tensor(array: Array) -> Tensor:
-    """Return a view of an array."""
+    """Return a view of an array as a tensor."""
     return torch.from_numpy(array) if isinstance(array, np.ndarray) else array

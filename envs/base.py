@@ -18,17 +18,17 @@ from torchrl_mcp.envs.rendering import Arrow, Camera
 from torchrl_mcp.envs.simulation import LARGEST
 
 ALL = slice(None)
-"""All simulations, as an index that takes no copy."""
+"""Index of all simulations that makes no copy."""
 
 
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
-    A task says what is observed, rewarded and ended and how an episode begins, in the methods at the end of this class.
-    The class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. What a task remembers
-    beyond the physics (a goal, a position before the step) lives in ``episode``, which snapshots include.
+    A task defines observations, rewards, terminations and initial states in the methods at the end of this class. The
+    class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. The state of a task
+    beyond the physics (a goal, a position before the step) is kept in ``episode``, which snapshots include.
 
-    A simulation that diverges, or is given a non-finite action, ends its own episode: it is ``terminated``, with reward
+    A simulation that diverges or gets a non-finite action ends only its own episode: it is ``terminated``, with reward
     0 and the observation from before the step, and ``num_diverged`` counts it.
 
     Args:
@@ -36,18 +36,18 @@ class CharacterEnv(EnvBase):
         num_envs: Number N of simulations.
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
-        episode: What the task remembers of one simulation at first; kept as ``(N, ...)``.
+        episode: Initial task state of one simulation, by name; stored as ``(N, ...)``.
         outputs: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         model_fields: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
-        physics: What simulates: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
-        device: Where simulations, rewards and what is emitted are; MuJoCo's threads need the CPU.
+        physics: The engine: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
+        device: Device of simulations, rewards and outputs; MuJoCo's threads need the CPU.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
         persistent: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         current: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
-        dtype: Type of what is emitted; rewards are computed in float64, physics in the type of the engine.
-        pin_memory: Emit pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
-            TorchRL merges what a partial reset emits into new tensors, which are not pinned.)
+        dtype: Type of the outputs; rewards are computed in float64, physics in the type of the engine.
+        pin_memory: Return pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
+            TorchRL merges the outputs of a partial reset into new tensors, which are not pinned.)
 
     Raises:
         ValueError: If an argument is out of range.
@@ -115,16 +115,16 @@ class CharacterEnv(EnvBase):
 
     @classmethod
     def characters(cls) -> tuple[str, ...]:
-        """Return the names of the characters that can do the task, or nothing where it does not say."""
+        """Return the names of the characters that can do the task; empty for no restriction."""
         return ()
 
     def mirrors(self) -> dict[str, Mirror]:
         """Return the reflections that exchange left and right in ``observation``, ``goal`` and ``action``.
 
-        The mirror image of a transition is one of the mirrored task, with the same reward.
+        The mirror image of a transition is a transition of the mirrored task, with the same reward.
 
         Raises:
-            ValueError: If the character or the task has none.
+            ValueError: If the character or the task has no mirror image.
         """
         raise ValueError(
             f"{type(self).__name__} has no mirror image, which symmetry needs: pass symmetry=none, or a task of biped, "
@@ -132,10 +132,7 @@ class CharacterEnv(EnvBase):
         )
 
     def reach(self) -> Reach | None:
-        """Returns of who stands still and of an ideal player, from the beginnings of the episodes just begun.
-
-        None where a task does not say.
-        """
+        """Returns of standing still and of an ideal player in the episodes just begun, None if the task has none."""
         return None
 
     @property
@@ -144,10 +141,10 @@ class CharacterEnv(EnvBase):
         return self.simulation.physics_seconds
 
     def get_state(self) -> TensorDict:
-        """Snapshot of all that the continuation depends on, save ``generator``: each entry ``(N, ...)``.
+        """Snapshot of the whole state except ``generator``, each entry ``(N, ...)``.
 
         ``reset(state, set_state=True)`` restores it, and the continuation is bit-identical. ``qpos`` and ``qvel`` alone
-        are a state too: the rest is then as at the beginning of an episode.
+        are a state as well: the other entries then take their values at the beginning of an episode.
         """
         state = {**self.simulation.state, **self.episode}
         return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
@@ -161,7 +158,7 @@ class CharacterEnv(EnvBase):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave: the next reset of all simulations returns to the snapshot."""
+        """Restore a result of :meth:`get_extra_state`: the next reset of all simulations returns to the snapshot."""
         self._snapshot = TensorDict(state["snapshot"], self.batch_size, device=self.device)
         self.generator.set_state(state["generator"].cpu())
         self.num_diverged = state["diverged"]
@@ -169,28 +166,28 @@ class CharacterEnv(EnvBase):
     def render(self, index: int = 0, *, width: int = 480, height: int = 480, distance: float = 4.0) -> Tensor:
         """Draw one simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
         if not 0 <= index < self.num_envs:
-            raise ValueError(f"index={index} names no simulation: pass one of 0..{self.num_envs - 1}")
+            raise ValueError(f"index={index} is out of range: pass one of 0..{self.num_envs - 1}")
         camera = self._camera_of(width, height)
         return camera.picture(self.simulation.data(index), self.arrows(index), distance=distance)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free what drawing holds."""
+        """Free the camera."""
         self._close_camera()
         super().close(raise_if_closed=raise_if_closed)
 
     def arrows(self, index: int) -> list[Arrow]:
-        """Return what shows the target of one simulation in films and viewers; tasks override it.
+        """Return arrows to the target of one simulation, for films and viewers; tasks override it.
 
         Args:
             index: The simulation.
 
         Returns:
-            Arrows, each its tail and tip, ``(3,)`` in metres.
+            Arrows, each as tail and tip, ``(3,)`` in metres.
         """
         return []
 
     def _camera_of(self, width: int, height: int) -> Camera:
-        """Return the camera for pictures of a size. There is one at a time: each holds tens of megabytes."""
+        """Return the camera for a picture size. Only one is kept, because each holds tens of megabytes."""
         if self._camera is None or self._camera[0] != (width, height):
             self._close_camera()
             self._camera = (width, height), Camera(self.simulation.model, width=width, height=height)
@@ -202,7 +199,7 @@ class CharacterEnv(EnvBase):
             self._camera = None
 
     def _make_specs(self) -> None:
-        """Derive the specs from what is observed; a task calls this at the end of its constructor."""
+        """Derive the specs from the observation; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
         bounds = self._action_bounds().to(self.device, self._dtype)
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
@@ -216,7 +213,7 @@ class CharacterEnv(EnvBase):
         self.full_done_spec = Composite(dones, shape=shape, device=self.device)
 
     def _type(self, value: Tensor) -> torch.dtype:
-        """Type in which something observed is emitted: flags remain flags."""
+        """Type of an observed value in the output: flags remain bool."""
         return torch.bool if value.dtype is torch.bool else self._dtype
 
     def _spec(self, value: Tensor) -> Binary | Unbounded:
@@ -228,13 +225,13 @@ class CharacterEnv(EnvBase):
         self.generator.manual_seed(drawn)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Step all simulations and begin new episodes where they have ended; see ``EnvBase.step_and_maybe_reset``.
+        """Step all simulations and begin new episodes after ended ones; see ``EnvBase.step_and_maybe_reset``.
 
-        The same as TorchRL's, but for what is known here: specs hold by construction, and what ``_emit`` tells
-        after a partial reset is what is shown of all simulations, so that nothing needs merging.
+        Faster than TorchRL's: specs hold by construction and need no check, and ``_emit`` returns the observations of
+        all simulations after a partial reset, which need no merging.
         """
         if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:
-            return super().step_and_maybe_reset(tensordict)  # the caller prescribes the outcome, or who takes part
+            return super().step_and_maybe_reset(tensordict)  # the caller sets the outcome, or the simulations that step
         outcome = self._step(tensordict)
         tensordict.set("next", outcome)
         state = self._step_mdp(tensordict)
@@ -269,7 +266,7 @@ class CharacterEnv(EnvBase):
         return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
 
     def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
-        """Begin episodes in the simulations ``ids``; what their ``state`` does not say is drawn."""
+        """Begin episodes in the simulations ``ids``; entries that ``state`` lacks are drawn."""
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
             state = {**self._sample(len(ids)), **state}
@@ -281,7 +278,7 @@ class CharacterEnv(EnvBase):
         return self._emit(ids if len(ids) < self.num_envs else ALL, None, no, no.clone())
 
     def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:
-        """Rows ``ids`` of the state in ``tensordict``, or an error that says what is wrong with it."""
+        """Rows ``ids`` of the state in ``tensordict``, after checking it."""
         known = {**self.simulation.state, **self.episode}
         ignored = {"_reset", "next", "action", "reward", *self.observation_spec.keys(), *self.done_keys} - known.keys()
         given = {} if tensordict is None else {k: v for k, v in tensordict.items() if k not in ignored}
@@ -297,7 +294,7 @@ class CharacterEnv(EnvBase):
         return {key: value[ids] for key, value in given.items()}
 
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
-        """What is told of all simulations, of which only ``ids`` have changed since the last time."""
+        """Output for all simulations, of which only ``ids`` have changed since the last output."""
         for key, value in self._observe(ids).items():
             if isinstance(ids, slice):
                 self._observed[key].copy_(value)
@@ -311,34 +308,34 @@ class CharacterEnv(EnvBase):
         return out.pin_memory() if self._pin_memory else out
 
     def _action_bounds(self) -> Tensor:
-        """Lower and upper bounds of the action, ``(A, 2)``: those of the controls."""
+        """Lower and upper bounds of the action, ``(A, 2)``: by default the bounds of the controls."""
         return torch.from_numpy(self.simulation.model.actuator_ctrlrange)
 
     def _controls(self, action: Tensor) -> Tensor:
-        """What the actuators are given, ``(N, A)``: the action as it is."""
+        """Controls of the actuators, ``(N, A)``: by default the action."""
         return action
 
     def _truncation(self) -> Tensor:
-        """Whether the task cannot go on, through no fault of the character: truncates the episode, ``(N, 1)``."""
+        """Whether the task ends for a reason other than failure, which truncates the episode, ``(N, 1)``."""
         return torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
 
     @abstractmethod
     def _sample(self, num: int) -> dict[str, Tensor]:
-        """Draw ``num`` beginnings of an episode from ``generator``: ``qpos``, ``qvel``, and parts of ``episode``."""
+        """Draw ``num`` initial states from ``generator``: ``qpos``, ``qvel``, and entries of ``episode``."""
 
     @abstractmethod
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
-        """The parts of ``episode`` that follow from the state at its beginning, rows of the simulations ``ids``."""
+        """The entries of ``episode`` that follow from the initial state, rows of the simulations ``ids``."""
 
     @abstractmethod
     def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        """What simulations show: ``observation``, ``goal`` and, for the record, flags and numbers of other names.
+        """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
 
         Args:
-            ids: Which, as indices ``(n,)`` or the slice of all.
+            ids: The simulations, as indices ``(n,)`` or the slice of all.
 
         Returns:
-            Each ``(n, ...)``; live views will do.
+            Observations, each ``(n, ...)``; live views are allowed.
         """
 
     @abstractmethod
@@ -346,10 +343,10 @@ class CharacterEnv(EnvBase):
         """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
 
         Args:
-            diverged: Simulations that did not move, shape ``(n,)``: what is returned for them is ignored.
+            diverged: Simulations that did not move, shape ``(n,)``; their results are ignored.
         """
 
     @property
     def metric_names(self) -> dict[str, list[str]]:
-        """What is observed for the record, not for the policy: the names of the entries of each key."""
+        """Observations that are metrics and not inputs of the policy: the names of the entries of each key."""
         return {key: [key] for key in self._observed if key not in ("observation", "goal")}

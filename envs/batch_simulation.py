@@ -18,20 +18,20 @@ from torchrl_mcp.envs.simulation import CHANGING_FIELDS, GIVEN_FIELDS, LARGEST, 
 class BatchSimulation(Simulation):
     """A batch of N simulations stepped by MuJoCo's thread pool, see :class:`~torchrl_mcp.envs.simulation.Simulation`.
 
-    MuJoCo's own answer to a divergence, a silent reset in the middle of a step, is switched off; its warnings still
-    reach ``MUJOCO_LOG.TXT`` in the working directory and say what happened. State and outputs are float64.
+    MuJoCo's default on divergence, a silent reset in the middle of a step, is switched off; its warnings still go to
+    ``MUJOCO_LOG.TXT`` in the working directory. State and outputs are float64.
 
     Args:
         model: The compiled model; a copy is kept.
         num_envs: Number N of simulations.
         substeps: Physics steps per call of :meth:`step`.
         num_threads: Threads; 0 takes one per processor. Results do not depend on it.
-        outputs: The other ``MjData`` fields to expose, beside the sensors. After :meth:`step` they are one substep
+        outputs: ``MjData`` fields to expose in addition to the sensors. After :meth:`step` they are one substep
             behind the state, as after ``mj_step``; after :meth:`reset` they are current.
-        model_fields: The ``MjModel`` fields of which every simulation has its own. They count as state.
+        model_fields: ``MjModel`` fields of which every simulation has its own copy. They count as state.
         persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
-        current: Bring outputs that follow from positions and velocities up to the state after every step. Free of
-            charge if ``persistent``: the next step begins with what was computed.
+        current: After every step, update the outputs that follow from positions and velocities. This costs nothing if
+            ``persistent``, because the next step reuses the results.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class BatchSimulation(Simulation):
         faults[failed] = True
         ids = faults.nonzero()[0]
         self._rows[ids] = self._before[ids]
-        self._run(self._batch.forward, ids, stage=self._after_reset)  # outputs that cannot be computed stay as they are
+        self._run(self._batch.forward, ids, stage=self._after_reset)  # outputs that fail to compute keep their values
         self._rows[ids] = self._before[ids]
         return torch.from_numpy(ids)
 
@@ -102,8 +102,8 @@ class BatchSimulation(Simulation):
     def contact_forces(self) -> Tensor:
         """See :meth:`Simulation.contact_forces`.
 
-        ``mj_step`` leaves them to ``mj_rnePostConstraint``, which ``Batch`` cannot call: each ``MjData`` is copied out
-        to Python, about 20 microseconds a piece on one thread.
+        They come from ``mj_rnePostConstraint``, which ``Batch`` cannot call, so each ``MjData`` is copied to Python, in
+        about 20 microseconds each on one thread.
         """
         forces = np.empty((len(self._rows), self.model.nbody, 6))
         start = time.perf_counter()
@@ -121,8 +121,8 @@ class BatchSimulation(Simulation):
         return self._data
 
     def _run(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> np.ndarray:
-        """Call MuJoCo, count the time, and return the simulations in which it raised an error."""
-        if os.getpid() != self._process:  # MuJoCo would wait for ever for threads that a fork does not copy
+        """Call MuJoCo, add the time, and return the simulations in which it raised an error."""
+        if os.getpid() != self._process:  # MuJoCo would wait forever for threads that a fork does not copy
             raise RuntimeError(
                 f"process {os.getpid()} inherited this environment by a fork from process {self._process}, without its "
                 "threads: make environments in the process that steps them"
@@ -141,12 +141,12 @@ _NOBODY = np.empty(0, dtype=np.int64)
 
 
 def _bounded(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Whether all values are numbers of a size below ``LARGEST``: a NaN compares false."""
+    """Whether all absolute values are below ``LARGEST``; false for NaN."""
     return (values.max(axis) < LARGEST) & (values.min(axis) > -LARGEST)
 
 
 def _view(array: np.ndarray) -> Tensor:
-    """An output as a tensor. They are read-only, which torch knows not of and warns about."""
+    """An output as a tensor. The array is read-only, which torch does not support and warns about."""
     array = array.view()
     array.flags.writeable = True
     return torch.from_numpy(array)

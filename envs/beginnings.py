@@ -1,4 +1,4 @@
-"""States in which episodes begin: at rest, or in the middle of a motion."""
+"""Initial states of episodes: at rest, or in the middle of a motion."""
 
 from collections.abc import Mapping
 
@@ -12,21 +12,21 @@ from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.placement import placing
 
 KINDS = ("rest", "motions")
-"""Of states: a character that stands still in its rest pose, and one at a random moment of a random motion."""
+"""Kinds of initial states: standing still in the rest pose, and a random moment of a random motion."""
 
 
 class Beginnings:
-    """Draws states in which episodes begin, each with its root over the origin and facing along x.
+    """Draws initial states of episodes, with the root over the origin and facing along x.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
-        initial_states: ``"rest"``, ``"motions"``, or a weight for each: relative to their sum, how often it is drawn.
-        motions: Library of motions, or clips by name; None for the character's generated motions, which are made only
-            if they are drawn from.
-        device: Where states are drawn.
+        initial_states: ``"rest"``, ``"motions"``, or a weight for each: its share of the sum is its probability.
+        motions: Library of motions, or clips by name; None for the character's generated motions, which are generated
+            only if needed.
+        device: Device of the states.
 
     Raises:
-        ValueError: If the kinds of states or their weights are none, or the motions are of another character.
+        ValueError: If a kind of states or a weight is invalid, or the motions are of another character.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Beginnings:
         return qpos, qvel
 
     def poses(self, interval: float = 0.1) -> Tensor:
-        """Poses that can be drawn, ``(P, nq)``: the rest pose, and motions every ``interval`` seconds."""
+        """Possible poses, ``(P, nq)``: the rest pose, and the motions every ``interval`` seconds."""
         if self.library is None:
             return self.rest.unsqueeze(0)
         every = [

@@ -13,47 +13,47 @@ from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
 from torchrl_mcp.envs.transport import Transport, mocap_positions
 
 MASS = 5.0
-"""Of the box, in kg. Paper: 5."""
+"""Mass of the box, in kg. Paper: 5."""
 
-# The paper gives no sizes. The tops end just inside the box, so that who walks up to a table touches the box first.
+# The paper states no sizes. The tops end just inside the box, so that a character at a table touches the box first.
 HALF_SIZE = 0.15
 TOP_HALF_SIZE = 0.14
 TOP_THICKNESS = 0.03
 DROP = 0.05
-"""Metres by which the target's top is lower than the source's: a box carried as it was found passes over it."""
+"""Metres by which the target's top is lower than the source's: a box carried at its initial height passes over it."""
 
 TOP_CONTACT = 2
-"""Bit of MuJoCo's contact types for the tops, which the box alone has: to characters, tops would be a wall."""
+"""MuJoCo's contact bit of the tops, which only the box shares: for characters, tops would be walls."""
 
 RESTING_GAP = 0.01
-"""Metres between box and top up to which the box stands on it."""
+"""Largest distance in metres between box and top at which the box stands on the top."""
 
 RELEASE_GAP = DROP + RESTING_GAP
-"""Metres between box and top up to which the joint lets the box down: a box carried as it was found is low enough."""
+"""Largest distance in metres between box and top at which the joint opens, reached at the box's initial height."""
 
 
 class Carry(Transport):
     """A character takes a box from a source table to a target table.
 
-    The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then holds the box
-    as it is. The joint opens once the box is over the target, less than 6 cm above it, and does not close again within
-    the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest point is
-    less than 1 cm above it. A box that was knocked off the source cannot be taken. ``success`` means that the box was
-    taken, is held no more, and stands on the target.
+    The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
+    to the carrier. The joint opens once the box is over the target, less than 6 cm above it, and does not close again
+    within the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest
+    point is less than 1 cm above it. A box that was knocked off the source cannot be taken. ``success`` means that the
+    box was taken, is no longer held, and stands on the target.
 
     ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
-    angular velocity of the box. The positions of the tables are those of the middle of their tops. See
+    angular velocity of the box. A table's position is the middle of its top. See
     :class:`~torchrl_mcp.envs.transport.Transport` for the variants of the reward.
 
-    The source is as high as it takes for the box to be level with the carrier's centre of mass in the rest pose. Tables
-    hold the box; characters pass through them, for a top at the height of a waist is a wall. So does the carrier
-    through the box: contact would work against the joint.
+    At the source's height, the box is level with the carrier's centre of mass in the rest pose. Tables hold the box;
+    characters pass through them, because a top at waist height would be a wall. The carrier passes through the box,
+    because contact would work against the joint.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.transport.Transport`: distances, reward and time limit. The
-            paper's distances begin at 0; here where the box touches no character and the tables stand apart.
+            paper's distances begin at 0; here they begin where the box touches no character and the tables are apart.
 
     Raises:
         ValueError: If an argument is out of range, or the character has no carrier.
@@ -128,16 +128,16 @@ class Carry(Transport):
         return rewards
 
     def success(self) -> Tensor:
-        """Whether the box was taken, is held no more and stands on the target, shape ``(N,)``, bool."""
+        """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
         put_down = (self.episode["taken"] == 1) & (self._joined == 0)
         success = torch.zeros_like(put_down)
         success[self._over(put_down, "target", RESTING_GAP)] = True
         return success
 
     def _over(self, candidates: Tensor, table: str, gap: float) -> Tensor:
-        """The simulations among ``candidates``, ``(N,)`` bool, in which the box is over a table, ``(n,)``.
+        """Simulations among ``candidates``, ``(N,)`` bool, in which the box is over a table, ``(n,)``.
 
-        Its lowest point is less than ``gap`` metres above the top.
+        The lowest point of the box is less than ``gap`` metres above the top.
         """
         ids = candidates.nonzero().squeeze(-1)
         if not len(ids):
@@ -149,7 +149,7 @@ class Carry(Transport):
 
 
 def relative_pose(position: Tensor, orientation: Tensor, other_position: Tensor, other_orientation: Tensor) -> Tensor:
-    """Another body's position and orientation as seen from a body, shape ``(*B, 7)``."""
+    """Another body's position and orientation in a body's frame, shape ``(*B, 7)``."""
     back = inverse(orientation)
     return torch.cat([rotate(back, other_position - position), multiply(back, other_orientation)], -1)
 
@@ -163,7 +163,7 @@ def height_of(spec: mujoco.MjSpec, body: str) -> float:
 
 
 def add_table(spec: mujoco.MjSpec, name: str, height: float, rgba: tuple[float, float, float, float]) -> None:
-    """Add a table, whose place is the middle of its top, ``height`` above the ground."""
+    """Add a table; its position is the middle of its top, ``height`` above the ground."""
     table, box = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, height]), mujoco.mjtGeom.mjGEOM_BOX
     top, leg = TOP_THICKNESS / 2, (height - TOP_THICKNESS) / 2
     size = [TOP_HALF_SIZE, TOP_HALF_SIZE, top]
@@ -188,11 +188,11 @@ def add_box(spec: mujoco.MjSpec, height: float) -> None:
 
 
 def add_joint(spec: mujoco.MjSpec, carrier: str) -> None:
-    """Let ``carrier`` hold the box where it is told to, not collide with it, and sense the gap between them."""
+    """Add a switchable joint between ``carrier`` and box, exclude their contact, and sense the gap between them."""
     body = mujoco.mjtObj.mjOBJ_BODY
     weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=body, name1=carrier, name2="box", active=False)
     weld.data[:3] = 0  # the anchor: the origin of the box
-    weld.solimp[:2] = 0.999  # MuJoCo's own 0.9 lets the box sag
+    weld.solimp[:2] = 0.999  # with MuJoCo's default of 0.9 the box sags
     spec.add_exclude(bodyname1=carrier, bodyname2="box")
     for index, geom in enumerate(spec.body(carrier).geoms):
         if geom.conaffinity:
@@ -203,5 +203,5 @@ def add_joint(spec: mujoco.MjSpec, carrier: str) -> None:
                 objname=geom.name,
                 reftype=mujoco.mjtObj.mjOBJ_GEOM,
                 refname="box",
-                cutoff=0.01,  # wider gaps are not told apart
+                cutoff=0.01,  # wider gaps are all reported as the cutoff
             )

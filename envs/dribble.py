@@ -12,42 +12,43 @@ from torch import Tensor
 from torchrl_mcp.envs.rewards import dribble_reward
 from torchrl_mcp.envs.transport import SUCCESS_DISTANCE, Transport
 
-# Radius, mass, friction and damping of the ball: those of the same authors' public code.
+# Radius, mass, friction and damping of the ball are from the same authors' public code.
 RADIUS = 0.2
 MASS = 0.43
 FRICTION = 0.4
 DAMPING = -math.log(1 - 0.4)
-"""Rate per second at which the ball loses speed and spin: its simulator's 0.4 is the share that is lost in a second."""
+"""Rate per second at which the ball loses speed and spin: the code's simulator loses a share of 0.4 in a second."""
 STIFFNESS = 12000.0
-"""Of its contacts, per second squared: it touches the ground for three physics steps of 1/120 s.
+"""Stiffness of the ball's contacts, per second squared: it touches the ground for three physics steps of 1/120 s.
 
-A stiffer ball would touch for fewer, and its bounce would depend on the moment at which it meets the ground.
+A stiffer ball would touch for fewer steps, and its bounce would depend on when within a step it meets the ground.
 """
 CONTACT_DAMPING = 25.0
-"""Of its contacts, per second: it leaves with 0.6 of the speed with which it came, as a football does on turf.
+"""Damping of the ball's contacts, per second: it bounces with 0.6 of its speed, like a football on turf.
 
 FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 0.55 to 0.71 of the speed.
 """
 
 SUCCESS_REACH = 2.0
-"""Metres from the ball within which the character must be for the task to count as done."""
+"""Largest distance in metres between character and ball for success."""
 
 
 class Dribble(Transport):
     """A character moves a ball to a target.
 
     ``goal`` (16) is the position of the target, and position, orientation, linear and angular velocity of the ball.
-    See :class:`~torchrl_mcp.envs.transport.Transport` for ``success``, for which the character must also be within 2 m
-    of the ball, and for the variants of the reward.
+    See :class:`~torchrl_mcp.envs.transport.Transport` for the variants of the reward and for ``success``, which here
+    also needs the character within 2 m of the ball.
 
-    The ball meets ground and all of the character, with its own friction. Its damping slows translation and rotation
-    alike, so that it rolls on without slipping and its speed falls to 60 % in a second. It bounces like a football.
+    The ball collides with the ground and the whole character, with its own friction. Its damping slows translation and
+    rotation alike, so that it rolls without slipping and its speed falls to 60 % in a second. It bounces like a
+    football.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         object_distances: Range (lo, hi) of the ball's distance from the character, in metres. Paper: 0 to 10; here from
-            0.5, as in the same authors' public code, or from where the ball does not touch the character.
+            0.5, as in the same authors' public code, or from the first distance without contact if that is larger.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.transport.Transport`: distances, reward and time limit.
 
     Raises:
@@ -86,7 +87,7 @@ class Dribble(Transport):
 
 
 def add_pitch(spec: mujoco.MjSpec) -> None:
-    """Add a target on the ground, which nothing collides with, and the ball."""
+    """Add a target on the ground without collisions, and the ball."""
     target = spec.worldbody.add_body(name="target", mocap=True)
     disc, ghost = mujoco.mjtGeom.mjGEOM_CYLINDER, {"contype": 0, "conaffinity": 0}
     target.add_geom(type=disc, size=[SUCCESS_DISTANCE, 0.002, 0], rgba=[0.9, 0.1, 0.1, 0.5], **ghost)
@@ -97,8 +98,8 @@ def add_pitch(spec: mujoco.MjSpec) -> None:
 def add_ball(spec: mujoco.MjSpec) -> None:
     """Add the ball, solid, at rest on the ground.
 
-    A free joint has one damping for forces and torques. Three slides and a ball joint have the same coordinates and a
-    damping each.
+    A free joint has one damping for forces and torques. Three slides and a ball joint have the same coordinates but
+    separate damping.
     """
     ball = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
     for name, axis, at in zip("xyz", np.eye(3), ball.pos, strict=True):
@@ -127,7 +128,7 @@ def add_ball(spec: mujoco.MjSpec) -> None:
         contype=1,
         conaffinity=1,
         friction=[FRICTION, 0, 0],
-        priority=1,  # its friction and bounce count, not the greater friction and the mean softness of the two
+        priority=1,  # use the ball's friction and bounce, not the greater friction and the mean softness of both geoms
         solref=[-STIFFNESS, -CONTACT_DAMPING],
         solimp=[0.97, 0.97, 0.001, 0.5, 2],
     )

@@ -1,4 +1,4 @@
-"""The engines that simulate: MuJoCo's threads on the CPU, and MuJoCo Warp on a GPU."""
+"""The physics engines: MuJoCo's threads on the CPU, and MuJoCo Warp on a GPU."""
 
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -11,7 +11,7 @@ from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.simulation import Simulation
 
 ENGINES = ("mujoco", "warp")
-"""The words of ``physics=``."""
+"""Values of ``physics=``."""
 
 
 def make_simulation(
@@ -27,30 +27,30 @@ def make_simulation(
     model_fields: Sequence[str],
     current: bool,
 ) -> Simulation:
-    """Return simulations of a model by an engine.
+    """Return simulations of a model with an engine.
 
     Args:
         model: The compiled model.
         num_envs: Number N of simulations.
         physics: The engine, one of ``ENGINES``.
-        device: Where state and outputs are.
-        num_threads: Of MuJoCo's thread pool.
-        persistent: Of MuJoCo's thread pool.
+        device: Device of state and outputs.
+        num_threads: Size of MuJoCo's thread pool.
+        persistent: Keep one ``MjData`` per simulation in MuJoCo's thread pool.
         substeps: Physics steps per call of :meth:`Simulation.step`.
-        outputs: The other ``MjData`` fields to expose, beside the sensors. After :meth:`Simulation.step` they are one
+        outputs: ``MjData`` fields to expose in addition to the sensors. After :meth:`Simulation.step` they are one
             substep behind the state, as after ``mj_step``; after :meth:`Simulation.reset` they are current.
-        model_fields: The ``MjModel`` fields of which every simulation has its own. They count as state.
-        current: Bring outputs that follow from positions and velocities up to the state after every step.
+        model_fields: ``MjModel`` fields of which every simulation has its own copy. They count as state.
+        current: After every step, update the outputs that follow from positions and velocities.
 
     Raises:
-        ValueError: If there is no such engine, it is not installed, or it does not run on the device.
+        ValueError: If the engine is unknown, is not installed, or does not run on the device.
     """
     shared: dict[str, Any] = {"substeps": substeps, "outputs": outputs, "model_fields": model_fields}
     require_engine(physics, device)
     if physics == "mujoco":
         shared |= {"num_threads": num_threads, "persistent": persistent}
         return BatchSimulation(model, num_envs, current=current, **shared)
-    from torchrl_mcp.envs.warp_simulation import WarpSimulation  # an extra, and its kernels take seconds to load
+    from torchrl_mcp.envs.warp_simulation import WarpSimulation  # an extra whose kernels take seconds to load
 
     return WarpSimulation(model, num_envs, current=current, device=device, **shared)
 
@@ -59,7 +59,7 @@ def require_engine(physics: str, device: torch.device) -> None:
     """Check that an engine is installed and runs on a device.
 
     Raises:
-        ValueError: If it is not, or does not.
+        ValueError: If the engine is unknown, is not installed, or does not run on the device.
     """
     if physics not in ENGINES:
         raise ValueError(f"physics={physics!r} is unknown: pass {' or '.join(ENGINES)}")

@@ -16,9 +16,9 @@ from torchrl_mcp.envs.base import CharacterEnv
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """A single simulation of a task with Gymnasium's interface; training is several times faster with many at once.
+    """A single simulation of a task with Gymnasium's interface; training with many at once is several times faster.
 
-    The observation is a dictionary of ``observation`` and ``goal``; ``info`` has what the task measures, such as
+    The observation is a dictionary of ``observation`` and ``goal``; ``info`` has the task's metrics, such as
     ``success`` of carrying and dribbling.
 
     Args:
@@ -66,11 +66,11 @@ class GymnasiumEnv(gymnasium.Env):
         return self._observed(outcome), outcome["reward"].item(), terminated, truncated, self._measured(outcome)
 
     def render(self) -> np.ndarray | None:
-        """Draw the simulation, shape ``(height, width, 3)``, uint8, if ``render_mode`` asks for it."""
+        """Draw the simulation, shape ``(height, width, 3)``, uint8, or return None without ``render_mode``."""
         return self.env.render().numpy() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free what drawing holds."""
+        """Free the camera."""
         self.env.close()
 
     def _measured(self, outcome: TensorDictBase) -> dict[str, float]:
@@ -91,13 +91,13 @@ def register(tasks: Sequence[type[CharacterEnv]], characters: Iterable[str]) -> 
 
 
 def register_holdout(task: type[CharacterEnv]) -> None:
-    """Register ``torchrl_mcp/Holdout-Ant-v0``, with directions all around unless others are given."""
+    """Register ``torchrl_mcp/Holdout-Ant-v0``, by default with all directions."""
     (character,) = task.characters()
     _register(task.__name__, character, partial(GymnasiumEnv, task, directions=(0.0, 2 * math.pi)))
 
 
 def register_imitation(task: type[CharacterEnv], characters: Iterable[str], motions: Callable[[str, int], Any]) -> None:
-    """Register imitation with every character, of ``motions`` of a seed and with the reward of ``imitation=fast``."""
+    """Register imitation with every character, with ``motions`` of a seed and the reward of ``imitation=fast``."""
 
     def make(character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:
         terms = yaml.safe_load(files("torchrl_mcp.conf").joinpath("imitation/fast.yaml").read_text())["terms"]

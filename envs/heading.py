@@ -19,16 +19,16 @@ class Heading(TransferTask):
 
     .. math:: \hat{\theta}_t = \hat{\theta}_{t-1} + \mathrm{Uniform}(-\delta, \delta)
 
-    ``goal`` (2) is the unit vector of the target direction in the character's heading frame. The reward of a step is
-    that of the direction which the action could see.
+    ``goal`` (2) is the unit vector of the target direction in the character's heading frame. The reward of a step
+    uses the direction that the action could see.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_turn: Largest change :math:`\delta` of the direction per step, in radians. Paper: 0.15.
         speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
-        initial_directions: Range (lo, hi) of the first direction, in radians from where the character faces. The paper
-            does not say; its returns of 0.97 leave no time to turn round, hence the default.
+        initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
+            faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`.
 
@@ -80,7 +80,7 @@ class Heading(TransferTask):
         return mirror_signs(VECTOR_SIGNS)
 
     def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`: who is ideal walks at the target speed from the first step on."""
+        """See :meth:`CharacterEnv.reach`: the ideal player walks at the target speed from the first step on."""
         still = torch.zeros(self.num_envs, 2, dtype=torch.float64, device=self.device)
         standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
         return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))

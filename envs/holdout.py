@@ -25,8 +25,8 @@ class Holdout(CharacterEnv):
     """Gymnasium's Ant-v5 with a target direction, drawn for each episode and observed as ``goal``.
 
     The paper pre-trains with directions in [0, 3/2 pi] and transfers to the held out [3/2 pi, 2 pi]. With the direction
-    +x, states and rewards are those of Gymnasium's Ant-v5: in particular the velocity is that of the torso, measured as
-    there, and the control cost is that of the action as given, though the motors clip it to [-1, 1].
+    +x, states and rewards equal those of Gymnasium's Ant-v5: in particular, the velocity is measured at the torso, as
+    there, and the control cost is computed from the unclipped action, though the motors clip it to [-1, 1].
 
     ``observation`` (27) is the root's height and orientation (quaternion), 8 joint angles, and 14 velocities; ``goal``
     (2) is (cos, sin) of the direction.
@@ -35,9 +35,9 @@ class Holdout(CharacterEnv):
         num_envs: Number N of simulations.
         directions: Range (lo, hi) of target directions in radians, counted from +x towards +y.
         max_episode_steps: Actions of 0.05 s until an episode is ``truncated``.
-        contact_forces: Observe the clipped external forces on 13 bodies (78 more numbers) and pay for them, as Ant-v5
-            does by default. They were always zero with the MuJoCo 2.0 of the paper's time, hence the default here. They
-            cost about 20 microseconds per simulation and step, on one thread.
+        contact_forces: Observe the clipped external forces on 13 bodies (78 more numbers) and add their cost to the
+            reward, as Ant-v5 does by default. They were always zero with MuJoCo 2.0, at the paper's time, hence the
+            default here. They take about 20 microseconds per simulation and step, on one thread.
         forward_weight: Weight of the velocity in the target direction, per m/s.
         healthy_weight: Reward per step for being healthy.
         control_weight: Cost of the squared action.
@@ -46,7 +46,7 @@ class Holdout(CharacterEnv):
         terminate_when_unhealthy: End the episode of an unhealthy ant.
         reset_noise_scale: Half-width of the uniform noise on the initial positions, and standard deviation of the
             normal noise on the initial velocities.
-        dtype: Type of what is emitted.
+        dtype: Type of the outputs.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.base.CharacterEnv`.
 
     Raises:
@@ -126,7 +126,7 @@ class Holdout(CharacterEnv):
         return ("ant",)
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
-        r"""Return on a scale where 0 earns nothing and 1 is what Gymnasium calls solved, unclipped.
+        r"""Return on a scale where 0 is a return of zero and 1 is Gymnasium's threshold for solved, unclipped.
 
         .. math:: \bar{R} = \frac{R}{T \, r^*}, \qquad r^* = \frac{6000}{1000}
 
@@ -142,7 +142,7 @@ class Holdout(CharacterEnv):
         return self.max_episode_steps * spec.reward_threshold / spec.max_episode_steps
 
     def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`: the ideal is what Gymnasium calls solved, which is no ceiling."""
+        """See :meth:`CharacterEnv.reach`: the ideal is Gymnasium's threshold for solved, which can be exceeded."""
         still = torch.zeros(self.num_envs, 2, device=self.device)
         action, healthy = torch.zeros_like(self.simulation.state["ctrl"]), torch.ones_like(still[:, 0])
         standing = self.max_episode_steps * self._reward(still, self.episode["goal"], action, healthy)

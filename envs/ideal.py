@@ -1,4 +1,4 @@
-"""What a return can reach: players without a body, who move as fast as a task asks for."""
+"""Bounds on returns from ideal players without a body, which move at the speed that a task asks for."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,22 +7,22 @@ import torch
 from torch import Tensor
 
 CLOSE = 0.01
-"""Metres between a player and the object that it moves: at none, the direction to the object is not defined."""
+"""Metres between a player and the object that it moves: at 0, the direction to the object is undefined."""
 
 
 class Reach(NamedTuple):
-    """Two returns between which those of a learner lie.
+    """Two returns that enclose the returns of a learner.
 
     Args:
-        standing: Of a player who does nothing and does not fall, ``(N,)``.
-        ideal: Of a player to whom the task's speed is the only limit, ``(N,)``.
+        standing: Return of a player that stands still without falling, ``(N,)``.
+        ideal: Return of a player that is limited only by the task's speed, ``(N,)``.
     """
 
     standing: Tensor
     ideal: Tensor
 
     def place(self, returns: Tensor) -> Tensor:
-        """Place of returns between the two, on average: 0 for standing still, 1 for the ideal, ``()``."""
+        """Mean position of returns between the two: 0 for standing still, 1 for the ideal, ``()``."""
         standing = self.standing.mean()
         return (returns.mean() - standing) / (self.ideal.mean() - standing)
 
@@ -37,16 +37,17 @@ def transport_reach(
     timestep: float,
     num_steps: int,
 ) -> Reach:
-    """Returns of who brings an object to its target: straight to the object, with it to the target, and then waits.
+    """Returns of a player that goes straight to an object, takes it straight to its target, and then waits.
 
     Args:
-        reward: Of centre of mass, its velocity, the object's position, its velocity, and the target, each ``(N, 2)``.
-        com: Where the player begins, ``(N, 2)``, in metres.
-        position: Where the object begins.
-        target: Where it is to go.
-        speed: Of player and object, in m/s.
-        timestep: Seconds of a step.
-        num_steps: Of the episode.
+        reward: Function of the centre of mass, its velocity, the object's position, its velocity, and the target, each
+            ``(N, 2)``.
+        com: Initial position of the player, ``(N, 2)``, in metres.
+        position: Initial position of the object, ``(N, 2)``, in metres.
+        target: Position of the target, ``(N, 2)``, in metres.
+        speed: Speed of player and object, in m/s.
+        timestep: Duration of a step in seconds.
+        num_steps: Steps of the episode.
     """
     still, stride = torch.zeros_like(com), speed * timestep
     standing = num_steps * reward(com, still, position, still, target)
@@ -61,7 +62,7 @@ def transport_reach(
 
 
 def _towards(start: Tensor, end: Tensor, stride: float, stop: float = 0.0) -> Tensor:
-    """A step from ``start``, at most as long as ``stride`` and no further than ``stop`` before ``end``, ``(N, 2)``."""
+    """A step from ``start`` towards ``end``, at most ``stride`` long, ending at least ``stop`` away, ``(N, 2)``."""
     way = end - start
     distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
     length = (distance - stop).clamp(0.0, stride)

@@ -1,4 +1,4 @@
-"""The imitation task: follow reference motions, which is how primitives are pre-trained."""
+"""The imitation task, for pre-training primitives: follow reference motions."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -20,7 +20,7 @@ from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
 
 NUM_TARGETS = 2
-"""States of the reference that the goal shows ahead (section 4)."""
+"""Number of future states of the reference in the goal (section 4)."""
 
 ERRORS = (
     "pose",
@@ -32,19 +32,19 @@ ERRORS = (
     "orientations",
     "com",
 )
-"""Respects in which a character differs from its reference, of which the terms of the reward are made."""
+"""Errors of a character against its reference, for the terms of the reward."""
 
 
 class Imitation(PDCharacterEnv):
     r"""A character follows reference motions, which change in the middle of an episode.
 
-    An episode begins at a random moment of a random clip, in the reference's own state. With probability
-    :math:`\Delta t /` ``switch_interval`` per step the reference becomes another random moment, brought to where the
-    character is and faces: of ``switch_candidates`` moments the one whose bodies are most like the character's, by
-    :func:`~torchrl_mcp.envs.imitation_reward.mismatch`. ``goal`` (2 x 13 L) holds, for the next two steps, the
-    positions of the L bodies of the reference relative to the ground below the character, their orientations and
-    velocities, in its heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the reference after
-    the step, in metres, and ``reward_terms`` (I) are the terms of the reward before a fall takes it away.
+    An episode begins at a random moment of a random clip, in the state of the reference. With probability
+    :math:`\Delta t /` ``switch_interval`` per step the reference jumps to another random moment, moved to the
+    character's position and heading: the moment of ``switch_candidates`` with the bodies closest to the
+    character's, by :func:`~torchrl_mcp.envs.imitation_reward.mismatch`. ``goal`` (2 x 13 L) holds, for the next two
+    steps, the positions of the reference's L bodies relative to the ground below the character, their orientations and
+    velocities, in the character's heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the
+    reference after the step, in metres, and ``reward_terms`` (I) are the reward's terms before a fall sets it to 0.
 
     The reward is the sum of :func:`~torchrl_mcp.envs.imitation_reward.imitation_rewards` of these errors: ``pose``, the
     mean squared angle of joints; ``velocity``, the mean squared difference of their velocities; ``root_pose`` and
@@ -53,12 +53,12 @@ class Imitation(PDCharacterEnv):
     bodies in the world; ``orientations``, the mean squared angle of all bodies in the world; ``com``, the squared
     distance of the centre of mass.
 
-    An episode ends, without reward and without value beyond, when the character falls or its bodies are on average
-    further than ``max_error`` from the reference. The end of a clip that does not loop truncates it, as the time limit
-    does, and the value of what would follow counts.
+    An episode terminates, with reward 0, when the character falls or its bodies are on average further than
+    ``max_error`` from the reference. The end of a clip that does not loop truncates the episode, as the time limit
+    does.
 
     With probability ``failure_weighting`` a moment is drawn where episodes end often, see
-    :class:`~torchrl_mcp.envs.adaptive_sampler.AdaptiveSampler`, and else evenly.
+    :class:`~torchrl_mcp.envs.adaptive_sampler.AdaptiveSampler`, and otherwise uniformly.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -66,15 +66,15 @@ class Imitation(PDCharacterEnv):
         num_envs: Number N of simulations.
         terms: Weight and scale of each error in the reward, by name.
         max_error: Largest mean distance of bodies from the reference, in metres; 0.5 is clearly worse than 0.3.
-        switch_interval: Mean time between changes of the reference, in seconds; infinite for none. The paper does not
-            say.
-        switch_candidates: Number of random moments of which the most similar becomes the reference: 1 asks for motions
-            that no body can go over to, as from a fast walk to standing, and with more of them changes become easier.
-        switch_to: ``"any"`` clip, or the ``"same"``, which brings a reference back to a character that has drifted off
-            and cannot see it.
-        clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
+        switch_interval: Mean time between changes of the reference, in seconds; infinite for none. Not stated in
+            the paper.
+        switch_candidates: Number of random moments of which the most similar becomes the reference. With 1, some
+            changes are impossible for a body, as from a fast walk to standing; more candidates make them easier.
+        switch_to: ``"any"`` clip, or the ``"same"``, which moves the reference back to a character that has drifted
+            away and does not observe it.
+        clip_end: Action at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
-        failure_weighting: Probability with which a moment is drawn where episodes end often rather than evenly.
+        failure_weighting: Probability of drawing a moment where episodes end often, rather than uniformly.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -86,7 +86,7 @@ class Imitation(PDCharacterEnv):
         section 4, https://arxiv.org/abs/1905.09808
     """
 
-    _next: PlacedMotion  # where the references are after the next step
+    _next: PlacedMotion  # states of the references after the next step
 
     def __init__(
         self,
@@ -161,11 +161,11 @@ class Imitation(PDCharacterEnv):
         return {**super().metric_names, "reward_terms": [f"reward_{name}" for name in self.terms]}
 
     def beginning(self, clips: Tensor, times: Tensor) -> dict[str, Tensor]:
-        """States for ``reset(set_state=True)`` that begin episodes at moments of clips, each ``(n, ...)``.
+        """Initial states for ``reset(set_state=True)`` at moments of clips, each ``(n, ...)``.
 
         Args:
             clips: Index of each clip in ``library``, shape ``(n,)``, int64.
-            times: Seconds since its first frame, shape ``(n,)``, float64.
+            times: Seconds since the clip's first frame, shape ``(n,)``, float64.
         """
         num, moment = len(clips), self.library.at(clips, times)
         turn, shift = torch.zeros_like(times), -moment.qpos[:, :2]
@@ -181,15 +181,15 @@ class Imitation(PDCharacterEnv):
         }
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See :meth:`CharacterEnv.get_extra_state`; and what motions there are, and where references are lost."""
+        """See :meth:`CharacterEnv.get_extra_state`; adds a digest of the motions and the sampler's counts."""
         own = {"motions": self.library.digest, "sampler": self._sampler.state_dict()}
         return {**super().get_extra_state(), **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave.
+        """Restore a result of :meth:`get_extra_state`.
 
         Raises:
-            ValueError: If it was given with other motions.
+            ValueError: If it comes from other motions.
         """
         if state["motions"] != self.library.digest:
             raise ValueError(
@@ -203,7 +203,7 @@ class Imitation(PDCharacterEnv):
         return self.beginning(*self._draw(num))
 
     def _draw(self, num: int, clips: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Draw moments, of the clips if these are given."""
+        """Draw moments, of ``clips`` if given."""
         if clips is not None:
             shares = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
             return clips, shares * self.library.durations[clips]
@@ -221,7 +221,7 @@ class Imitation(PDCharacterEnv):
         angle, place = self.heading(ids), self._positions[ids, 0]
         targets = self._look_ahead(ids)
         placement = cast("Placement", targets.placement)
-        # Seen from the character, a reference looks as its clip does from where it would be there.
+        # Equivalent to moving the reference to the character: view the clip from the character's place in its frame.
         ground = place * self._horizontal
         origin = placement.inverse().points(ground.repeat(NUM_TARGETS, 1))
         turn = angle.repeat(NUM_TARGETS) - placement.turn
@@ -235,7 +235,7 @@ class Imitation(PDCharacterEnv):
         }
 
     def _look_ahead(self, ids: Tensor | slice) -> PlacedMotion:
-        """The references of n simulations in the next steps, one step after the other, ``(NUM_TARGETS * n, ...)``."""
+        """References of n simulations in the next steps, ordered by step, ``(NUM_TARGETS * n, ...)``."""
         clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
         num, times = len(clip), (time + self._ahead).flatten()
         placement = Placement(turn.repeat(NUM_TARGETS), shift.repeat(NUM_TARGETS, 1))
@@ -258,7 +258,7 @@ class Imitation(PDCharacterEnv):
         return reward.masked_fill(lost, 0.0), ended
 
     def _switch(self) -> None:
-        """Give some characters another reference, like what they do, where they are and facing as they do."""
+        """Change the references of some simulations to a similar moment, at the character's position and heading."""
         changes = torch.rand(self.num_envs, generator=self.generator, device=self.device) < self.switch_probability
         if self.clip_end == "switch":
             changes |= self._ended()
@@ -276,7 +276,7 @@ class Imitation(PDCharacterEnv):
             self.episode[key][ids] = values[chosen].to(self.episode[key].dtype)
 
     def _error(self, name: str, reference: PlacedMotion) -> Tensor:
-        """How far the character is from the reference in one respect, one of ``ERRORS``, ``(N,)``."""
+        """One of ``ERRORS`` between character and reference, ``(N,)``."""
         qpos, qvel, layout = self.simulation.state["qpos"], self.simulation.state["qvel"], self._layout
         positions, targets = self._positions, reference.positions
         match name:
@@ -305,7 +305,7 @@ class Imitation(PDCharacterEnv):
                 raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
 
     def _centre_of_mass(self, reference: PlacedMotion) -> Tensor:
-        """Of the character, if its bodies were there, ``(N, 3)``."""
+        """Centre of mass of the character with its bodies at the reference, ``(N, 3)``."""
         places = reference.positions + rotate(reference.orientations, self._centres_of_mass)
         return self._masses @ places / self._masses.sum()
 
@@ -313,7 +313,7 @@ class Imitation(PDCharacterEnv):
         return (self._ended() & (self.clip_end == "truncate")).unsqueeze(-1)
 
     def _ended(self) -> Tensor:
-        """Whether clips end before the last target that would be shown next, ``(N,)``."""
+        """Whether clips end before the last target of the next goal, ``(N,)``."""
         clips = self.episode["clip"]
         ahead = self.episode["time"] + NUM_TARGETS * CONTROL_TIMESTEP
         return (ahead > self.library.durations[clips]) & ~self.library.loops[clips]

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 
 HORIZON = 0.25
-"""Seconds after which a difference of velocities has become one of places."""
+"""Seconds by which velocities are multiplied, to compare them with positions."""
 
 
 class Term(NamedTuple):
@@ -20,7 +20,7 @@ class Term(NamedTuple):
 
 
 def imitation_rewards(errors: Mapping[str, Tensor], terms: Mapping[str, Term]) -> Tensor:
-    r"""Terms of the reward of motion imitation: how close the character is to the reference in several respects.
+    r"""Terms of the imitation reward: similarity of character and reference by several errors.
 
     .. math:: r = \sum_i r_i, \quad r_i = w_i \exp(-c_i e_i)
 
@@ -49,7 +49,7 @@ def squared_angles(one: Tensor, other: Tensor) -> Tensor:
         Shape ``(*B)``, in squared radians.
     """
     chord = torch.minimum((one - other).square().sum(-1), (one + other).square().sum(-1)).sqrt()
-    return (4 * torch.asin((chord / 2).clamp(max=1.0))).square()  # unlike acos exact for small angles
+    return (4 * torch.asin((chord / 2).clamp(max=1.0))).square()  # accurate for small angles, unlike acos
 
 
 def squared_distances(one: Tensor, other: Tensor) -> Tensor:
@@ -58,7 +58,7 @@ def squared_distances(one: Tensor, other: Tensor) -> Tensor:
 
 
 def mismatch(one: BodyStates, other: BodyStates) -> Tensor:
-    r"""How unlike two moments are: the mean squared distance of bodies, and what that of their velocities makes of it.
+    r"""Mismatch of two moments: the mean squared difference of the bodies' positions and, weighted, of velocities.
 
     .. math:: \frac{1}{L} \sum_l |x_l - \hat{x}_l|^2 + \tau^2 |v_l - \hat{v}_l|^2, \quad \tau = 0.25 \text{ s}
 

@@ -1,4 +1,4 @@
-"""The mirror image of what a character sees and does: left and right exchanged."""
+"""Mirror images of a character's observations and actions, with left and right exchanged."""
 
 from collections.abc import Sequence
 
@@ -9,18 +9,18 @@ from torch import Tensor, nn
 from torchrl_mcp.envs.motions.joints import twin
 
 BODY_SIGNS = (1, -1, 1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
-"""Signs of what is seen of a body: a vector changes y, a rotation or a spin, being a pseudo-vector, x and z."""
+"""Signs of a body's observation: a vector changes y; a rotation or spin, a pseudo-vector, changes x and z."""
 
 VECTOR_SIGNS = (1, -1)
 """Signs of a horizontal vector."""
 
 
 class Mirror(nn.Module):
-    """A reflection of numbers: which of them takes the place of each, and its sign there. Its own inverse.
+    """A reflection of features, as a permutation with signs. It is its own inverse.
 
     Args:
-        sources: Index of what takes each number's place, ``F`` of them.
-        signs: Its sign there.
+        sources: Index of the feature that replaces each feature, ``F`` of them.
+        signs: Sign of each feature after the permutation.
 
     Example:
         >>> left_right_up = Mirror([1, 0, 2], [1, 1, -1])
@@ -42,16 +42,16 @@ class Mirror(nn.Module):
 
 
 def mirror_signs(signs: Sequence[float]) -> Mirror:
-    """Return the reflection of numbers that keep their places."""
+    """Return the reflection that changes signs only."""
     return Mirror(range(len(signs)), signs)
 
 
 def mirror_bodies(names: Sequence[str], *, repeats: int = 1) -> Mirror:
-    """Return the reflection of what :func:`~torchrl_mcp.envs.observations.bodies_in_heading_frame` gives.
+    """Return the reflection of :func:`~torchrl_mcp.envs.observations.bodies_in_heading_frame`.
 
     Args:
-        names: Of the bodies, ``left_`` and ``right_`` on either side.
-        repeats: How often all of them are seen, one time after the other.
+        names: Names of the bodies, with ``left_`` and ``right_`` for the two sides.
+        repeats: Number of consecutive observations of all bodies.
     """
     size = len(BODY_SIGNS)
     twins = [names.index(twin(name)) for name in names]
@@ -67,7 +67,7 @@ def mirror_state(names: Sequence[str]) -> Mirror:
 
 
 def mirror_actions(model: mujoco.MjModel) -> Mirror:
-    """Return the reflection of the controls of a character: targets of rotations, scaled alike on either side."""
+    """Return the reflection of a character's controls, which are rotation targets with the same scale on both sides."""
     names = [model.actuator(index).name for index in range(model.nu)]
     axes = torch.tensor([_axis(model, index) for index in range(model.nu)])
     sources = torch.tensor([names.index(twin(name)) for name in names])
@@ -76,7 +76,7 @@ def mirror_actions(model: mujoco.MjModel) -> Mirror:
 
 
 def _axis(model: mujoco.MjModel, actuator: int) -> list[float]:
-    """About which axis an actuator turns, in the rest pose."""
+    """Rotation axis of an actuator in the rest pose."""
     joint = model.actuator_trnid[actuator, 0]
     hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
     axis: list[float] = (model.jnt_axis[joint] if hinge else model.actuator_gear[actuator, :3]).tolist()

@@ -1,7 +1,7 @@
 """The observation of a character's own state, as functions of arrays.
 
-They run right after the physics, which leaves nothing in the cache: there an operation of NumPy takes a third of one of
-torch. So on the CPU they work on arrays, component by component, with the simulations side by side: ``(L, 13, n)``.
+They run right after the physics, which evicts the caches; there an operation takes NumPy a third of torch's time. On
+the CPU they therefore use arrays, stored by component with the simulations side by side: ``(L, 13, n)``.
 """
 
 import numpy as np
@@ -12,20 +12,20 @@ from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.rotations import about_z, multiply, rotate
 
 SIZES = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
-"""What is seen of a body, in this order: 13 numbers."""
+"""Quantities observed of a body, in this order, with their sizes: 13 numbers."""
 
 _TURNS = np.array([1.0, 1.0, 1.0, 0.5, 0.5], np.float32).reshape(5, 1, 1, 1)
-"""By how many times the heading pairs of components turn: of three vectors, and two of a quaternion."""
+"""Factors on the heading by which pairs of components turn: those of three vectors, and two of a quaternion."""
 
 
 def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -> Tensor:
-    """Bodies as seen from a place and a heading: position, orientation, linear and angular velocity of each.
+    """Position, orientation, linear and angular velocity of bodies, in the frame of an origin and a heading.
 
-    Of the two quaternions of an orientation, q and -q, the one whose w is positive.
+    An orientation is the quaternion with positive w.
 
     Args:
         angle: Heading in radians, shape ``(*B)``.
-        origin: The place, shape ``(*B, 3)``, in metres.
+        origin: Origin of the frame, shape ``(*B, 3)``, in metres.
         bodies: L bodies in world coordinates, each ``(*B, L, ...)``.
 
     Returns:
@@ -38,10 +38,10 @@ def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -
 
 
 def character_state(angle: Tensor, bodies: BodyStates) -> Tensor:
-    """State s of a character: all its bodies as seen from the root, whatever its place and heading in the world.
+    """State s of a character, which does not depend on its place and heading in the world.
 
-    The height of the root, then for every body its position relative to the root, its orientation, its linear and its
-    angular velocity, in the frame that moves with the root and turns with its heading. See :func:`state_layout`.
+    It has the height of the root, then for every body the position relative to the root, orientation, linear and
+    angular velocity, in the frame of the root's position and heading. See :func:`state_layout`.
 
     Args:
         angle: The root's heading in radians, shape ``(*B)``.
@@ -63,7 +63,7 @@ def character_state(angle: Tensor, bodies: BodyStates) -> Tensor:
 
 
 def _seen(angle: Tensor, origin: Tensor, bodies: BodyStates) -> np.ndarray:
-    r"""Bodies as seen from a place and a heading, ``(L, 13, n)``.
+    r"""Return :func:`bodies_in_heading_frame` as an array, ``(L, 13, n)``.
 
     A turn by :math:`-\psi` about z takes a pair of components :math:`(a, b)` to :math:`(a \cos + b \sin, b \cos - a
     \sin)`: of a vector (x, y) by :math:`\psi`, of a quaternion (w, z) and (x, y) by :math:`\psi / 2`.
@@ -108,17 +108,17 @@ def _planes(field: Tensor) -> np.ndarray:
 
 
 def _pair(vectors: np.ndarray) -> np.ndarray:
-    """The x and the y of vectors, ``(L, 3, n)``, as ``(2, L, n)``."""
+    """Components x and y of vectors, ``(L, 3, n)``, as ``(2, L, n)``."""
     return vectors[:, :2].swapaxes(0, 1)
 
 
 def _rows(seen: np.ndarray, angle: Tensor) -> Tensor:
-    """Numbers of n simulations, ``(D, n)``, as ``(*B, D)``."""
+    """An array of n simulations, ``(D, n)``, as a tensor ``(*B, D)``."""
     return torch.from_numpy(np.ascontiguousarray(seen.T)).reshape(*angle.shape, len(seen))
 
 
 def state_layout(bodies: list[str]) -> dict[str, slice]:
-    """Where to find each quantity in :func:`character_state`, by the names of the bodies."""
+    """Slices of :func:`character_state`, by body and quantity."""
     layout, start = {"root_height": slice(0, 1)}, 1
     for body in bodies:
         for quantity, size in SIZES.items():

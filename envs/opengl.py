@@ -1,4 +1,4 @@
-"""OpenGL contexts for drawing without a display, and the search for a library that has them."""
+"""OpenGL contexts for drawing without a display, and the search for a library that works."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ from typing import Protocol
 import mujoco
 
 PLATFORMS = ("egl", "osmesa", "glfw")
-"""Values of ``MUJOCO_GL`` on Linux in the order in which they are tried: a GPU's driver, the processor, a display."""
+"""Values of ``MUJOCO_GL`` on Linux in the order of trial: a GPU's driver, the processor, a display."""
 
 PROBE = """
 import mujoco
@@ -25,17 +25,17 @@ class GLContext(Protocol):
     """The interface of MuJoCo's OpenGL contexts on all platforms."""
 
     def make_current(self) -> None:
-        """Let what is drawn next be drawn here."""
+        """Make this the target of drawing."""
 
     def free(self) -> None:
-        """Give back what it holds."""
+        """Free the context."""
 
 
 def new_context(width: int, height: int) -> GLContext:
-    """Open OpenGL for pictures up to a size in pixels.
+    """Open an OpenGL context for pictures up to a size in pixels.
 
     Raises:
-        RuntimeError: If none works here, or not the one that the environment variable ``MUJOCO_GL`` names.
+        RuntimeError: If no platform works, or the one in the environment variable ``MUJOCO_GL`` does not.
     """
     if (platform := _platform()) is None:
         asked = os.environ.get("MUJOCO_GL")
@@ -49,17 +49,17 @@ def new_context(width: int, height: int) -> GLContext:
 
 @cache
 def _platform() -> Callable[[int, int], GLContext] | None:
-    """Return the class of contexts that works here: ``MUJOCO_GL``'s if that is set, else the first of ``PLATFORMS``."""
+    """Return the class of contexts that works: the one in ``MUJOCO_GL`` if set, else the first of ``PLATFORMS``."""
     asked = os.environ.get("MUJOCO_GL", "")
     found = next(filter(_works, PLATFORMS if sys.platform == "linux" and not asked else (asked,)), None)
     if found not in PLATFORMS:
         return None if found is None else mujoco.GLContext
-    # MuJoCo has chosen a class of its own on import. Where OpenGL's functions are it looks up when it first draws.
+    # MuJoCo chose its own class on import, but looks up OpenGL's functions when it first draws.
     os.environ["MUJOCO_GL"] = found
     return import_module(f"mujoco.{found}").GLContext
 
 
 def _works(platform: str) -> bool:
-    """Try a platform in a process of its own: a failure may end the process, and PyOpenGL keeps to its first choice."""
+    """Try a platform in a separate process: a failure may end the process, and PyOpenGL keeps its first platform."""
     environment = {**os.environ, "MUJOCO_GL": platform}
     return subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0

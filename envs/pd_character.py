@@ -1,4 +1,4 @@
-"""Characters under PD control: their state, falls and scene, which all their tasks share."""
+"""Characters under PD control: state, falls and scene, for all their tasks."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -29,9 +29,9 @@ class PDCharacterEnv(CharacterEnv):
     r"""A character that follows target poses, on flat ground.
 
     ``action``, in [-1, 1], scales to the targets of the PD controllers: exponential maps for ball joints and angles for
-    hinges. Zero is the rest pose, standing upright; 1 is half the width of the range that the target may have, which
-    clips it. ``observation`` is :func:`~torchrl_mcp.envs.observations.character_state`, whose entries
-    ``observation_layout`` names.
+    hinges. Zero is the rest pose, standing upright; 1 is half the width of the target's range, to which the target is
+    clipped. ``observation`` is :func:`~torchrl_mcp.envs.observations.character_state`; ``observation_layout`` has the
+    names of its entries.
 
     The character *falls* when any body but its feet touches the ground. That ends the episode; the reward of the fall
     is 0.
@@ -40,13 +40,13 @@ class PDCharacterEnv(CharacterEnv):
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
-        episode: What the task remembers of one simulation at first, beside ``com``, the centre of mass.
-        furnish: Adds what the task needs to the scene, after character, ground and light.
+        episode: Initial task state of one simulation, in addition to ``com``, the centre of mass.
+        furnish: Function that adds the task's bodies to the scene, after character, ground and light.
         physics_timestep: Seconds, a whole fraction of 1/30; None is the character's own choice.
         self_collision: Let bodies of the character collide with one another.
         friction_cone: MuJoCo's cone of contact forces, ``"pyramidal"`` or ``"elliptic"``. A pyramid has edges along the
-            world's axes: the same motion turned by 45 degrees slides otherwise. An ellipse has none, but takes 26 to
-            38 % of the speed.
+            world's axes: a motion turned by 45 degrees slides differently. An ellipse has no edges, but reduces the
+            speed by 26 to 38 %.
         terminate_on_fall: End the episode of a fallen character.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.base.CharacterEnv`.
 
@@ -104,13 +104,13 @@ class PDCharacterEnv(CharacterEnv):
         shapes = falling_geoms(model, self.character.feet, len(self._bodies))
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
-        """Where to find each quantity in ``observation``, by name."""
+        """Slices of ``observation`` by name."""
         # Live views, made once. The character's bodies follow the world, which is body 0.
         bodies, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
         self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
         self._com = outputs["subtree_com"][:, 1]
         self._geom_heights = as_array(outputs["geom_xpos"])[..., 2]
-        # Rows by numbers, component by component: several times as fast as the rows of matrices.
+        # Columns by component index are several times as fast as rows of matrices.
         self._geom_axes = as_array(outputs["geom_xmat"]).reshape(num_envs, -1)
         axes = torch.tensor([[6], [7], [8]])
         self._vertical_columns = as_array((9 * shapes[0] + axes).flatten().to(self.device))
@@ -119,7 +119,7 @@ class PDCharacterEnv(CharacterEnv):
 
     @classmethod
     def characters(cls) -> tuple[str, ...]:
-        """See :meth:`CharacterEnv.characters`: all that are known."""
+        """See :meth:`CharacterEnv.characters`: all known characters."""
         return tuple(CHARACTERS)
 
     def mirrors(self) -> dict[str, Mirror]:
@@ -135,7 +135,7 @@ class PDCharacterEnv(CharacterEnv):
         return super().mirrors()["goal"]
 
     def heading(self, ids: Tensor | slice = ALL) -> Tensor:
-        """Direction that characters face, in radians from the world's x axis, shape ``(n,)``, float64."""
+        """Heading of characters, in radians from the world's x axis, shape ``(n,)``, float64."""
         return heading(self._orientations[ids, 0])
 
     def fallen(self) -> Tensor:
@@ -145,7 +145,7 @@ class PDCharacterEnv(CharacterEnv):
         return as_tensor((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
 
     def _com_velocity(self) -> Tensor:
-        """Horizontal displacement of the centre of mass in the step just made, per second, ``(N, 2)``."""
+        """Mean horizontal velocity of the centre of mass in the last step, ``(N, 2)``, in m/s."""
         velocity = (self._com - self.episode["com"])[:, :2] / self.control_timestep
         self.episode["com"].copy_(self._com)
         return velocity
@@ -156,14 +156,14 @@ class PDCharacterEnv(CharacterEnv):
         return reward.masked_fill(fallen, 0.0), fallen & self.terminate_on_fall
 
     def _look_at(self, bodies: slice) -> None:
-        """Choose the bodies that are observed: one tree, or several with a body each."""
+        """Set the observed bodies: one tree, or several trees."""
         outputs = {key: as_array(value) for key, value in self.simulation.outputs.items()}
         self._bodies_seen = [outputs[key][:, bodies] for key in ("xpos", "xquat", "cvel")]
         trees = torch.from_numpy(self.simulation.model.body_rootid[bodies]).to(self.device)
         self._centres = outputs["subtree_com"], as_array(trees if len(trees.unique()) > 1 else trees[:1])
 
     def _body_states(self, ids: Tensor | slice) -> BodyStates:
-        """The observed bodies in the world, in ``dtype``; stored component by component, which is faster to work on."""
+        """States of the observed bodies in the world, in ``dtype``; stored by component, for speed."""
         rows = ids if isinstance(ids, slice) else as_array(ids)
         centres, trees = self._centres
         if self.device.type != "cpu":
@@ -171,7 +171,7 @@ class PDCharacterEnv(CharacterEnv):
         positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._bodies_seen)
         arms = np.subtract(positions, centres[rows][:, trees].transpose(1, 2, 0), order="C")
         angular, linear = np.ascontiguousarray(twists[:, :3]), twists[:, 3:]
-        # MuJoCo gives the velocity of the point of each body that passes the centre of mass of its tree.
+        # MuJoCo's cvel is the velocity of each body at the point of the centre of mass of its tree.
         across = angular[:, [1, 2, 0]] * arms[:, [2, 0, 1]] - angular[:, [2, 0, 1]] * arms[:, [1, 2, 0]]
         parts = (positions, orientations, across + linear, angular)
         return BodyStates(*(torch.from_numpy(part.astype(self._array_type, "C")).permute(2, 0, 1) for part in parts))
@@ -195,16 +195,16 @@ class PDCharacterEnv(CharacterEnv):
 
 
 def body_states(parts: Sequence[Tensor], centres: Tensor, dtype: torch.dtype) -> BodyStates:
-    """What MuJoCo computes of bodies as their states in the world.
+    """Convert MuJoCo's outputs to the states of bodies in the world.
 
     Args:
         parts: ``xpos``, ``xquat`` and ``cvel`` of L bodies, each ``(n, L, ...)``.
-        centres: Centre of mass of the tree of each, ``(n, L, 3)``, or of the only one, ``(n, 1, 3)``.
-        dtype: Of the states.
+        centres: Centre of mass of each body's tree, ``(n, L, 3)``, or of the only tree, ``(n, 1, 3)``.
+        dtype: Type of the states.
     """
     positions, orientations, twists = parts
     angular, linear = twists.split(3, -1)
-    # MuJoCo gives the velocity of the point of each body that passes the centre of mass of its tree.
+    # MuJoCo's cvel is the velocity of each body at the point of the centre of mass of its tree.
     linear = linear + torch.linalg.cross(angular, positions - centres)
     return BodyStates(*(part.to(dtype) for part in (positions, orientations, linear, angular)))
 
@@ -234,14 +234,14 @@ def add_ground(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground", contype=1, conaffinity=1
     )
-    # The light follows the character, for shadows are drawn near where it shines.
+    # The light follows the character, because MuJoCo draws shadows only near the lit point.
     sun, follow = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_TRACK
     spec.bodies[1].add_light(name="sun", type=sun, mode=follow, pos=[3, -4, 10], dir=[-0.3, 0.4, -1])
-    spec.visual.map.shadowclip = 20.0  # where the map of shadows ends the ground is speckled
+    spec.visual.map.shadowclip = 20.0  # beyond the shadow map the ground is speckled
 
 
 def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The shapes that must not touch the ground: all that collide, of all bodies but the feet.
+    """The geoms that must not touch the ground: colliding geoms of all bodies except the feet.
 
     Returns:
         Their ids ``(G,)``, half-sizes ``(G, 3)`` and radii ``(G,)`` for :func:`lowest_points`.
@@ -270,16 +270,16 @@ def lowest_points(heights: Numbers, vertical: Numbers, half_sizes: Numbers, radi
 
     .. math:: z - r - \sum_i |R_{3i}| h_i
 
-    Each is the set of points within a radius :math:`r` of a box of half-sizes :math:`h`, turned by :math:`R`: a sphere
-    has no box, a capsule one without width, and a box no radius.
+    Each is the set of points within a radius :math:`r` of a box of half-sizes :math:`h`, turned by :math:`R`. For a
+    sphere the box is a point, for a capsule a line, and for a box the radius is 0.
 
     Args:
-        heights: Of the centres, z, in metres, shape ``(*B, G)``.
-        vertical: The last row of each rotation matrix, shape ``(*B, G, 3)``.
-        half_sizes: In metres, shape ``(G, 3)``.
-        radii: In metres, shape ``(G,)``.
+        heights: Heights z of the centres in metres, shape ``(*B, G)``.
+        vertical: Last row of each rotation matrix, shape ``(*B, G, 3)``.
+        half_sizes: Half-sizes h in metres, shape ``(G, 3)``.
+        radii: Radii r in metres, shape ``(G,)``.
 
     Returns:
-        Shape ``(*B, G)``, in metres.
+        Heights, shape ``(*B, G)``, in metres.
     """
     return heights - radii - (abs(vertical) * half_sizes).sum(-1)

@@ -1,4 +1,4 @@
-"""What a task draws evenly for each episode, and mixtures of ranges to draw from."""
+"""Ranges of the quantities that a task draws for each episode, and mixtures of ranges."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
@@ -10,16 +10,15 @@ from torchrl_mcp.envs.arguments import interval
 
 
 class Ranges:
-    """Intervals by name, from which a number each is drawn for an episode, and weighted alternatives to them.
+    """Uniform distributions over named intervals, one number each per episode, with weighted alternatives.
 
     Args:
         ranges: Interval (lo, hi) by name.
-        mixture: Alternatives. Each names intervals of its own, which replace those of ``ranges``, and its ``weight``, 1
-            if it names none: relative to the sum of weights, the share of episodes that draw from it. Empty for
-            ``ranges`` alone.
+        mixture: Alternatives. Each has intervals that replace those of ``ranges``, and a ``weight``, by default 1; its
+            share of the sum of weights is its share of the episodes. Empty for ``ranges`` alone.
 
     Raises:
-        ValueError: If something is no interval, of a name that ``ranges`` has not, or no weight.
+        ValueError: If an interval or a weight is invalid, or ``ranges`` lacks a name.
 
     Example:
         >>> near = {"weight": 3, "distances": (0.0, 1.0)}
@@ -43,8 +42,8 @@ class Ranges:
         self._weights = torch.tensor(weights, dtype=torch.float64)
 
     def draw(self, num: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draw for ``num`` episodes: by name, ``(num,)``, float64."""
-        draws = max(num, 1)  # multinomial draws no empty sample
+        """Draw numbers for ``num`` episodes: by name, ``(num,)``, float64."""
+        draws = max(num, 1)  # multinomial cannot draw an empty sample
         chosen = torch.multinomial(self._weights, draws, replacement=True, generator=generator)[:num]
         low, high = self._bounds[chosen].unbind(-1)
         shares = torch.rand(low.shape, dtype=torch.float64, device=low.device, generator=generator)
@@ -52,15 +51,15 @@ class Ranges:
         return dict(zip(self._names, drawn.unbind(-1), strict=True))
 
     def to(self, device: torch.device) -> Self:
-        """Draw on a device from now on, where the generator must be, and return these ranges."""
+        """Move the ranges to the generator's device, and return them."""
         self._bounds, self._weights = self._bounds.to(device), self._weights.to(device)
         return self
 
     def require_distances(self, *names: str) -> None:
-        """Check that ranges are of distances, which are not negative.
+        """Check that ranges are distances.
 
         Raises:
-            ValueError: If one begins below 0.
+            ValueError: If a range begins below 0.
         """
         for name in names:
             for low, high in self._of(name).tolist():
@@ -68,10 +67,10 @@ class Ranges:
                     raise ValueError(f"{name}={(low, high)} begins below 0: pass two distances (lo, hi) in metres")
 
     def keep_clear(self, name: str, clearance: float) -> None:
-        """Leave out distances below ``clearance`` metres, where bodies would overlap.
+        """Raise the lower bounds of distances to ``clearance`` metres, below which bodies would overlap.
 
         Raises:
-            ValueError: If a range has no others.
+            ValueError: If a range ends below ``clearance``.
         """
         bounds = self._of(name)
         for low, high in bounds.tolist():
@@ -80,5 +79,5 @@ class Ranges:
         bounds[:, 0].clamp_(min=clearance)
 
     def _of(self, name: str) -> Tensor:
-        """Bounds of a name in all alternatives, ``(M, 2)``, a live view."""
+        """Bounds of a named range in all M alternatives, ``(M, 2)``, a live view."""
         return self._bounds[:, self._names.index(name)]

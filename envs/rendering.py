@@ -26,18 +26,18 @@ GIF_COLOURS = 64
 """Number of colours of a picture in a GIF: the file is half as large as with 256."""
 
 MAX_SHAPES = 2000
-"""Of a scene. MuJoCo reserves room for them."""
+"""Largest number of shapes in a scene, for which MuJoCo reserves memory."""
 
 
 class Shape(NamedTuple):
-    """A shape to draw beside a simulation, for ``mujoco.mjv_initGeom``.
+    """A shape to draw in addition to a simulation, for ``mujoco.mjv_initGeom``.
 
     Args:
-        kind: What it is.
-        size: As of a geom of that kind in the model, shape ``(3,)``, in metres.
-        position: Of its centre, or of an arrow's tail, shape ``(3,)``, in metres.
+        kind: Type of geom.
+        size: Size of a geom of that type in a model, shape ``(3,)``, in metres.
+        position: Position of the centre, or of an arrow's tail, shape ``(3,)``, in metres.
         orientation: Rotation matrix, shape ``(9,)``.
-        colour: Shape ``(4,)``, float32.
+        colour: Red, green, blue and opacity, shape ``(4,)``, float32.
     """
 
     kind: mujoco.mjtGeom
@@ -55,12 +55,12 @@ def arrow(tail: np.ndarray, tip: np.ndarray, colour: Colour = RED) -> Shape:
 
 
 def ghost(model: mujoco.MjModel, qpos: np.ndarray, colour: Colour = PALE) -> list[Shape]:
-    """Return the shapes of all that moves in a model, where they would be in another state.
+    """Return the shapes of all moving bodies of a model in another state.
 
     Args:
         model: The model; its shapes are spheres, capsules, cylinders, ellipsoids and boxes.
         qpos: The state, shape ``(nq,)``.
-        colour: Of all shapes.
+        colour: Colour of all shapes.
     """
     data = mujoco.MjData(model)
     data.qpos = qpos
@@ -74,7 +74,7 @@ def ghost(model: mujoco.MjModel, qpos: np.ndarray, colour: Colour = PALE) -> lis
 
 
 def add_shapes(scene: mujoco.MjvScene, shapes: Iterable[Shape]) -> None:
-    """Put shapes into a scene beside what it holds."""
+    """Add shapes to a scene."""
     for geom, shape in zip(scene.geoms[scene.ngeom :], shapes, strict=False):
         mujoco.mjv_initGeom(geom, *shape)
         scene.ngeom += 1
@@ -84,9 +84,9 @@ class Camera:
     """A camera that follows a body and draws into memory.
 
     Args:
-        model: The model to draw; its off-screen buffer is enlarged where the picture needs it.
-        width: Pixels.
-        height: Pixels.
+        model: The model to draw; its off-screen buffer is enlarged if needed.
+        width: Width in pixels.
+        height: Height in pixels.
         body: The body to follow, 1 for the first below the world.
 
     Raises:
@@ -130,10 +130,10 @@ class Camera:
 
 def save_gif(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
     """Write RGB pictures as an animated GIF, one every ``interval`` seconds."""
-    # An octree keeps the colours of small parts.
+    # An octree preserves the colours of small areas.
     octree, plain = Image.Quantize.FASTOCTREE, Image.Dither.NONE
     first, *others = (picture.quantize(GIF_COLOURS, octree, dither=plain) for picture in pictures)
-    # A GIF counts in hundredths of a second: what is rounded off one picture is added to the next.
+    # A GIF counts in hundredths of a second: rounding errors carry over to the next picture.
     ticks = [round(100 * interval * number) for number in range(len(others) + 2)]
     durations = [10 * (end - begin) for begin, end in pairwise(ticks)]
     first.save(path, save_all=True, append_images=others, duration=durations, loop=0)

@@ -16,7 +16,7 @@ def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
         direction: Target direction :math:`\hat{u}`, a unit vector, shape ``(*B, 2)``. The paper writes
-            :math:`(\cos\hat{\theta}, -\sin\hat{\theta})` for a world whose y axis points up; here z does, and
+            :math:`(\cos\hat{\theta}, -\sin\hat{\theta})` for a world whose y axis points up; here the z axis does, and
             :math:`\hat{u} = (\cos\hat{\theta}, \sin\hat{\theta})`.
         speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
 
@@ -48,7 +48,7 @@ def holdout_reward(
         r = w^{forward} \hat{u} \cdot v_{com} + w^{healthy} 1[healthy] - w^{control} \|a\|^2 - w^{contact} \|c\|^2
 
     With :math:`\hat{u} = (1, 0)` this is the reward of Gymnasium's Ant-v5. The paper writes the two costs as (negative)
-    reward terms and prints the name of the third weight twice; the fourth is that of the contacts.
+    reward terms and prints the name of the third weight twice; the fourth belongs to the contacts.
 
     Args:
         velocity: Horizontal velocity of the body :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
@@ -56,10 +56,10 @@ def holdout_reward(
         action: Action :math:`a`, shape ``(*B, A)``.
         healthy: Whether the character still walks, shape ``(*B)``, bool.
         contact_forces: Clipped external forces :math:`c`, shape ``(*B, F)``, or None to leave their cost out.
-        forward_weight: Paper: 1.
-        healthy_weight: Paper: 1.
-        control_weight: Paper: 0.5.
-        contact_weight: Paper: 0.0005.
+        forward_weight: Weight of the velocity. Paper: 1.
+        healthy_weight: Reward for being healthy. Paper: 1.
+        control_weight: Weight of the control cost. Paper: 0.5.
+        contact_weight: Weight of the contact cost. Paper: 0.0005.
 
     Returns:
         Reward, shape ``(*B)``.
@@ -97,14 +97,14 @@ def transport_reward(
         r^{bv} &= \exp(-\min(0, u_{tar} \cdot v_b - \hat{v})^2) \\
         r^{bp} &= \exp(-0.5 \, \|x_b - x_{tar}\|^p)
 
-    where the minimum is squared, :math:`u_b` is the direction from the character to the object and :math:`u_{tar}` that
-    from the object to the target. All quantities are horizontal.
+    where the minimum is squared, :math:`u_b` is the direction from the character to the object and :math:`u_{tar}` the
+    direction from the object to the target. All quantities are horizontal.
 
     Args:
         com: Centre of mass of the character :math:`x_{com}`, shape ``(*B, 2)``, in metres.
-        com_velocity: Its velocity :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
+        com_velocity: Velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
         position: Position of the object :math:`x_b`, shape ``(*B, 2)``, in metres.
-        velocity: Its velocity :math:`v_b`, shape ``(*B, 2)``, in m/s.
+        velocity: Velocity of the object :math:`v_b`, shape ``(*B, 2)``, in m/s.
         target: Position of the target :math:`x_{tar}`, shape ``(*B, 2)``, in metres.
         weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
         proximity_scale: :math:`c`, per square metre.
@@ -119,7 +119,7 @@ def transport_reward(
         appendix D, https://arxiv.org/abs/1905.09808
     """
     ways = torch.stack([position - com, target - position])
-    towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a way of no length
+    towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a zero vector
     missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
     (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
     exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
@@ -128,12 +128,12 @@ def transport_reward(
 
 @cache
 def _on(device: torch.device, numbers: tuple[float, ...]) -> Tensor:
-    """Numbers on a device, brought there once, float64."""
+    """Numbers as a tensor on a device, float64, copied there once."""
     return torch.tensor(numbers, dtype=torch.float64, device=device)
 
 
 def idle_reward(weights: Sequence[float], speed: float) -> float:
-    r"""What the speeds in :func:`transport_reward` earn while nothing moves.
+    r"""Reward of the speed terms in :func:`transport_reward` while nothing moves.
 
     .. math:: w^{cv} \exp(-1.5 \hat{v}^2) + w^{bv} \exp(-\hat{v}^2)
 

@@ -20,7 +20,7 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
         ]
-    ).movedim(0, -1)  # so stored component by component, which is faster to work on
+    ).movedim(0, -1)  # stored by component, for speed
 
 
 def inverse(q: Tensor) -> Tensor:
@@ -51,7 +51,7 @@ def from_rotation_vector(v: Tensor) -> Tensor:
 
 
 def to_rotation_vector(q: Tensor) -> Tensor:
-    """Logarithm: axis times angle, shape ``(*B, 3)``, of the shorter way, so that the angle is at most pi."""
+    """Logarithm: axis times angle, shape ``(*B, 3)``, with an angle of at most pi."""
     q = torch.where(q[..., :1] < 0, -q, q)
     w, u = q[..., :1], q[..., 1:]
     sine = torch.linalg.vector_norm(u, dim=-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
@@ -77,13 +77,13 @@ def about_z(angle: Tensor) -> Tensor:
 
 
 def heading(q: Tensor) -> Tensor:
-    """Direction on the ground of a body's x axis, shape ``(*B)``, as an angle from the world's x axis in (-pi, pi]."""
+    """Horizontal angle of a body's x axis from the world's x axis, shape ``(*B)``, in (-pi, pi]."""
     w, x, y, z = q.unbind(-1)
     return torch.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
 def slerp(a: Tensor, b: Tensor, fraction: Tensor) -> Tensor:
-    r"""Interpolate at constant angular velocity along the shorter way.
+    r"""Interpolate at constant angular velocity along the shorter arc.
 
     .. math:: \frac{\sin (1 - t) \theta}{\sin \theta} a + \frac{\sin t \theta}{\sin \theta} b,
         \quad \cos \theta = a \cdot b
@@ -95,7 +95,7 @@ def slerp(a: Tensor, b: Tensor, fraction: Tensor) -> Tensor:
     """
     b = torch.where((a * b).sum(-1, keepdim=True) < 0, -b, b)
     difference, total = torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1)
-    angle = 2 * torch.atan2(difference, total) / torch.pi  # unlike acos exact where a and b are close
+    angle = 2 * torch.atan2(difference, total) / torch.pi  # accurate if a and b are close, unlike acos
     whole = torch.sinc(angle)
     before = (1 - fraction) * torch.sinc((1 - fraction) * angle) / whole
     after = fraction * torch.sinc(fraction * angle) / whole
@@ -103,7 +103,7 @@ def slerp(a: Tensor, b: Tensor, fraction: Tensor) -> Tensor:
 
 
 def continuous(q: Tensor) -> Tensor:
-    """Choose the signs of a sequence of quaternions: the first has w >= 0, each next is close to the one before.
+    """Choose the signs of a sequence of quaternions: w >= 0 in the first, and each next one close to its predecessor.
 
     Args:
         q: Quaternions over time, shape ``(*B, T, 4)``.

@@ -12,22 +12,22 @@ from torchrl_mcp.envs.motions.placement import Placement
 from torchrl_mcp.envs.rendering import Colour, Shape, arrow, ghost
 
 HAZE: Colour = (0.87, 0.90, 0.94, 1.0)
-"""Colour into which the ground fades."""
+"""Colour of the haze on the ground."""
 
 ZENITH: Colour = (0.45, 0.62, 0.82, 1.0)
 """Colour of the sky above."""
 
 GROUND = (150, 205)
-"""Darkest and lightest pixel of the ground, of 255."""
+"""Darkest and lightest pixel of the ground, from 0 to 255."""
 
 
 def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Shape]:
-    """Return what to draw beside one of the simulations.
+    """Return the shapes to draw in addition to one of the simulations.
 
     Args:
         env: The environments.
         index: The simulation.
-        aside: Metres by which a ghost is moved along y, so as not to cover the character; 0 leaves it where it belongs.
+        aside: Metres by which a ghost is moved along y, so as not to cover the character; 0 for its true place.
     """
     shapes = [arrow(*ends) for ends in env.arrows(index)]
     if isinstance(env, Imitation):
@@ -38,20 +38,20 @@ def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Sh
 
 
 def reference(env: Imitation, index: int = 0) -> Tensor:
-    """State in which the reference of one of the simulations is now, where the character is to be, ``(nq,)``."""
+    """Current state of the reference of one of the simulations, ``(nq,)``."""
     clip, time, turn, shift = (env.episode[key][index : index + 1] for key in ("clip", "time", "turn", "shift"))
     return env.library.at(clip, time, Placement(turn, shift)).qpos[0]
 
 
 def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour = ZENITH) -> mujoco.MjModel:
-    """Return a copy of a scene in soft light, whose ground is pale, mirrors nothing and fades into :data:`HAZE`.
+    """Return a copy of a scene in soft light, with a pale, matt ground that fades into :data:`HAZE`.
 
-    The haze is drawn where a scene's flag ``mjRND_FOG`` is set.
+    The haze is drawn if a scene's flag ``mjRND_FOG`` is set.
 
     Args:
         model: The scene.
-        horizon: Colour of its sky, if it has one, at the horizon and below.
-        zenith: Colour of its sky above.
+        horizon: Colour of the sky, if there is one, at the horizon and below.
+        zenith: Colour of the sky above.
     """
     model = copy.copy(model)
     light = model.vis.headlight
@@ -59,7 +59,7 @@ def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour 
     model.light_diffuse[:], model.light_specular[:] = 0.55, 0.1
     model.vis.rgba.fog = HAZE
     model.vis.map.fogstart, model.vis.map.fogend = np.array([5.0, 15.0]) / model.stat.extent
-    model.vis.map.shadowclip = 35.0 / model.stat.extent  # where the map of shadows ends the ground is speckled
+    model.vis.map.shadowclip = 35.0 / model.stat.extent  # beyond the shadow map the ground is speckled
     model.mat_reflectance[:] = 0
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).tolist():
         _extend(model, plane)
@@ -71,9 +71,9 @@ def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour 
 
 
 def sky_picture(width: int, horizon: Colour, zenith: Colour) -> np.ndarray:
-    """Return the six faces of a cube of sky, one below the other as MuJoCo has them, ``(6 * width, width, 3)``, uint8.
+    """Return the six faces of a sky cube, stacked in MuJoCo's order, ``(6 * width, width, 3)``, uint8.
 
-    Right, left, up, down, front and back; the first row of those at the sides is the uppermost.
+    The order is right, left, up, down, front and back; the first row of a side face is at the top.
     """
     side = (2 * np.arange(width) + 1) / width - 1
     away = np.sqrt(1 + side[:, None] ** 2 + side**2)
@@ -84,7 +84,7 @@ def sky_picture(width: int, horizon: Colour, zenith: Colour) -> np.ndarray:
 
 
 def extent(model: mujoco.MjModel) -> float:
-    """Return how far the first body below the world, in its rest pose, extends from its centre of mass, in metres."""
+    """Return the largest distance of the first body's tree from its centre of mass in the rest pose, in metres."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     own = model.body_rootid[model.geom_bodyid] == 1
@@ -93,7 +93,7 @@ def extent(model: mujoco.MjModel) -> float:
 
 
 def _extend(model: mujoco.MjModel, plane: int) -> None:
-    """Make a plane endless, with its pattern as it was: MuJoCo draws haze on large finite ones as if they were far."""
+    """Make a plane infinite with the same pattern: on large finite planes, MuJoCo draws haze as if they were far."""
     size, material = model.geom_size[plane, :2], model.geom_matid[plane]
     if material >= 0 and (size > 0).all() and not model.mat_texuniform[material]:
         model.mat_texrepeat[material] /= size
@@ -102,7 +102,7 @@ def _extend(model: mujoco.MjModel, plane: int) -> None:
 
 
 def _fade(model: mujoco.MjModel, plane: int) -> None:
-    """Bring the pixels of a plane's pattern into the range of :data:`GROUND`."""
+    """Clip the pixels of a plane's pattern to :data:`GROUND`."""
     material = model.geom_matid[plane]
     texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
     if texture >= 0:
@@ -111,6 +111,6 @@ def _fade(model: mujoco.MjModel, plane: int) -> None:
 
 
 def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """Return the pixels of a texture, a live view of one dimension."""
+    """Return the pixels of a texture, a one-dimensional live view."""
     size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
     return model.tex_data[model.tex_adr[texture] :][:size]

@@ -1,4 +1,4 @@
-"""Many simulations of one MuJoCo model, as torch tensors: what every engine offers."""
+"""Many simulations of one MuJoCo model as torch tensors: the interface of the engines."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -6,31 +6,30 @@ from collections.abc import Mapping
 import mujoco
 from torch import Tensor
 
-# The parts of mjSTATE_INTEGRATION in order, by the names of their MjData fields: all that the next step depends on.
+# The MjData fields of mjSTATE_INTEGRATION in order: everything that the next step depends on.
 CHANGING_FIELDS = ("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl")
 GIVEN_FIELDS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata", "plugin_state")
 
 LARGEST = mujoco.mjMAXVAL
-"""MuJoCo's own limit (1e10): a larger state has diverged."""
+"""MuJoCo's limit (1e10): a larger state has diverged."""
 
 
 class Simulation(ABC):
-    """A batch of N simulations with faults contained.
+    """A batch of N simulations with isolated faults.
 
-    A simulation *faults* in a step when its engine cannot compute it, when its state leaves the finite numbers below
-    ``LARGEST``, or when its controls do. It then keeps the state it had before the step, and its neighbours do not
-    notice.
+    A simulation *faults* in a step if its engine cannot compute the step, or if its state or controls are not finite or
+    not below ``LARGEST``. It then keeps its state from before the step, and other simulations are not affected.
 
-    State and outputs have the names and shapes of ``MjData`` in every engine, after the number of the simulation. Their
-    type is the engine's.
+    State and outputs have the names and shapes of ``MjData`` in every engine, after the dimension of simulations. Their
+    type depends on the engine.
     """
 
     model: mujoco.MjModel
-    """The compiled model, which all simulations share but for its ``model_fields``."""
+    """The compiled model, which all simulations share except its ``model_fields``."""
     state: dict[str, Tensor]
-    """Live views of the state fields that the model has, each ``(N, ...)``. Writing sets the state."""
+    """Live views of the model's state fields, each ``(N, ...)``. Writing sets the state."""
     outputs: dict[str, Tensor]
-    """Live views of the outputs, each ``(N, ...)``: results of the last call, not to be written to."""
+    """Live views of the outputs of the last call, each ``(N, ...)``; read-only."""
     physics_seconds: float
     """Wall-clock seconds spent inside the engine so far."""
 
@@ -42,15 +41,15 @@ class Simulation(ABC):
             ctrl: Controls, shape ``(N, A)``.
 
         Returns:
-            The simulations that faulted, shape ``(n,)``, int64; usually none.
+            Indices of the simulations that faulted, shape ``(n,)``, int64; usually none.
         """
 
     @abstractmethod
     def reset(self, ids: Tensor, fields: Mapping[str, Tensor]) -> None:
-        """Set the state of some simulations and bring their outputs up to date.
+        """Set the state of some simulations and update their outputs.
 
         Args:
-            ids: The n simulations, shape ``(n,)``, int64.
+            ids: Indices of the n simulations, shape ``(n,)``, int64.
             fields: Values of state fields, each ``(n, ...)``; the other fields take the model's defaults.
         """
 
@@ -64,4 +63,4 @@ class Simulation(ABC):
 
     @abstractmethod
     def data(self, index: int) -> mujoco.MjData:
-        """One simulation as an ``MjData`` with everything computed, to draw it or to look into it."""
+        """One simulation as a fully computed ``MjData``, for drawing or inspection."""

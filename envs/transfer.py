@@ -1,4 +1,4 @@
-"""What tasks for pre-trained characters share: where their episodes begin, and shaping of their reward."""
+"""The base class of tasks for pre-trained characters: initial states, and shaping of the reward."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -18,39 +18,39 @@ from torchrl_mcp.envs.ranges import Ranges
 from torchrl_mcp.envs.shaping import Ramp, potential, shaping_reward
 
 TASK_REWARD = "task_reward"
-"""Key under which environments that let training learn from another reward show the task's own."""
+"""Key of the task's own reward in environments that train on another reward."""
 
 
 def task_reward(outcome: TensorDictBase) -> Tensor:
-    """The task's own reward of steps, whether or not training learns from another, ``(*B, 1)``.
+    """The task's own reward of steps, also if training uses another, ``(*B, 1)``.
 
     Args:
-        outcome: What an environment says after its steps, batch size ``(*B,)``.
+        outcome: Output of an environment's steps, batch size ``(*B,)``.
     """
     return outcome.get(TASK_REWARD, outcome["reward"])
 
 
 class TransferTask(PDCharacterEnv):
-    """A task for characters that can walk, and what training on it may use: by default nothing of it.
+    """A task for characters that can walk, with aids for training that are off by default.
 
-    Episodes may begin in motion, and in easier places than those of the task. What is learnt from may be another
-    reward, and shaping may add rewards for progress; ``task_reward`` (1) then shows the task's own beside ``reward``.
+    Episodes may begin in motion, and in easier situations than those of the task. Training may use another reward, and
+    shaping may add rewards for progress; ``task_reward`` (1) is then the task's own, beside ``reward``.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
-        ranges: What the task draws evenly for each episode, intervals by name.
+        ranges: Intervals of the quantities that are drawn uniformly for each episode, by name.
         mixture: Alternatives to ``ranges``, see :class:`~torchrl_mcp.envs.ranges.Ranges`.
         initial_states: ``"rest"``, ``"motions"`` or a weight for each, see
             :class:`~torchrl_mcp.envs.beginnings.Beginnings`.
-        motions: To begin in, None for the generated ones.
+        motions: Motions for initial states, None for the generated ones.
         shaping: ``slope`` and ``reach`` of the :func:`~torchrl_mcp.envs.shaping.potential` by the names of the task's
-            distances; none for no shaping. A fallen character has no potential.
-        discount: Of the learner, for shaping.
-        staggered: Cut the first episodes short, each by another length, so that simulations are never all at the same
-            moment of an episode: a batch of short trajectories would show that moment alone.
-        practised: Whether the task lets training learn from another reward than its own.
-        episode: What the task remembers of one simulation at first.
+            distances; None for no shaping. A fallen character has potential 0.
+        discount: Discount factor of the learner, for shaping.
+        staggered: Shorten the first episodes by different lengths, so that simulations are at different times of their
+            episodes: otherwise a batch of short trajectories would cover a single time.
+        practised: Whether training uses another reward than the task's.
+        episode: Initial task state of one simulation.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
     Raises:
@@ -58,7 +58,7 @@ class TransferTask(PDCharacterEnv):
     """
 
     distances: tuple[str, ...] = ()
-    """Names of the distances that the task shortens, of which shaping can be made."""
+    """Names of the distances that the task shortens, for shaping."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class TransferTask(PDCharacterEnv):
 
     @abstractmethod
     def _rewards(self) -> Tensor:
-        """Rewards of the step just made, unless the character has fallen, float64; updates ``episode``.
+        """Rewards of the last step, unless the character has fallen, float64; updates ``episode``.
 
-        The task's own, ``(1, N)``, or it and the one that is learnt from, ``(2, N)``.
+        The task's own, ``(1, N)``, or the task's own and the one for training, ``(2, N)``.
         """

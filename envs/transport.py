@@ -1,4 +1,4 @@
-"""The base class of carrying and dribbling: an object, a target, and the way between them."""
+"""The base class of carrying and dribbling: moving an object to a target."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from torchrl_mcp.envs.rewards import idle_reward
 from torchrl_mcp.envs.transfer import TransferTask
 
 SUCCESS_DISTANCE = 0.5
-"""Metres between object and target from which the task counts as done; so in the same authors' public code."""
+"""Distance in metres between object and target for success, as in the same authors' public code."""
 
 ANY_DIRECTION = (-math.pi, math.pi)
 """All directions, in radians."""
@@ -29,40 +29,39 @@ ANY_DIRECTION = (-math.pi, math.pi)
 class Transport(TransferTask):
     """A character moves an object to a target; distances and directions are drawn uniformly for each episode.
 
-    ``goal`` shows the things of the scene in the character's heading frame, positions relative to the root;
-    ``goal_layout`` names its entries. ``success`` (1, bool) says whether the object is now at the target, that is,
+    ``goal`` describes the scene's other bodies in the character's heading frame, with positions relative to the root;
+    ``goal_layout`` has the names of its entries. ``success`` (1, bool) is whether the object is at the target, that is,
     horizontally within 0.5 m.
 
-    The reward is by default as printed in the paper. Two variants of the same authors' public code may be switched on:
-    the plain distance to the target, which unlike its square still says something at 10 m, and every term 1 while
-    successful. What lies at the target does not move, for which the printed reward is at most 0.73; with the second
-    variant it is 1.
+    The reward is by default as printed in the paper. Two variants of the same authors' public code are options: the
+    distance to the target instead of its square, which still has a gradient at 10 m, and reward 1 while successful. An
+    object at rest at the target has a printed reward of at most 0.73; with the second variant it is 1.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
-        things: Bodies that ``furnish`` adds, in this order, the target first and the object last, and how many numbers
-            of each the goal shows: of its position (3), orientation (4), linear (3) and angular velocity (3).
-        furnish: Adds these bodies to the scene: the object with 7 coordinates and 6 velocities, the others as mocap
-            bodies.
+        things: Bodies that ``furnish`` adds, in this order, the target first and the object last, each with how many
+            numbers the goal has of position (3), orientation (4), linear (3) and angular velocity (3).
+        furnish: Function that adds these bodies to the scene: the object with 7 coordinates and 6 velocities, the
+            others as mocap bodies.
         reward: :func:`~torchrl_mcp.envs.rewards.transport_reward` with the task's constants.
-        object_distances: Range (lo, hi) of the object's distance from the character, in metres; lo is raised to where
-            they do not overlap.
-        object_directions: Range (lo, hi) of the direction of the object, in radians from where the character faces.
+        object_distances: Range (lo, hi) of the object's distance from the character, in metres; lo is raised until they
+            do not overlap.
+        object_directions: Range (lo, hi) of the direction of the object, in radians from the character's heading.
         target_distances: Range (lo, hi) of the target's distance from the object, in metres.
         target_directions: Range (lo, hi) of the direction from the object to the target, in radians from the direction
-            in which the object lies: 0 is beyond the object.
+            of the object: 0 is straight beyond the object.
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
-        success_reward: Give the reward 1 while successful.
-        emphasis: ``weights`` of the four terms and ``target_distance_power`` of the reward that is learnt from, in
-            which speeds count from standing still and every term is 1 while successful; None for the task's own. Of the
-            printed reward, standing still earns a third of the best, and who learns from it learns to stand.
+        success_reward: Set the reward to 1 while successful.
+        emphasis: ``weights`` of the four terms and ``target_distance_power`` of the reward for training, in which speed
+            terms are 0 while standing still and every term is 1 while successful; None for the task's own. With the
+            printed reward, standing still earns a third of the best return, and policies learn to stand.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
-        episode: What the task remembers beside the object's position.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`: what training may use. Shaping knows
-            two distances: ``object``, from the character to the object, and ``target``, from there to the target.
+        episode: Initial task state of one simulation, in addition to the object's position.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`: aids for training. Shaping has two
+            distances: ``object``, from the character to the object, and ``target``, from the object to the target.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -97,7 +96,7 @@ class Transport(TransferTask):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
         self.success_reward, self.speed = success_reward, speed
         self.goal_layout = goal_layout(things)
-        """Where to find each quantity in ``goal``, by name."""
+        """Slices of ``goal`` by name."""
         self._shown = dict(things)
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
         self._emphasised, self._idle, self._full = None, 0.0, 1.0
@@ -122,11 +121,11 @@ class Transport(TransferTask):
             **kwargs,
         )
         self.ranges.require_distances("object_distances", "target_distances")
-        # Live views, made once. The things follow the character's bodies.
+        # Live views, made once. The task's bodies follow the character's.
         rows, outputs = slice(1 + len(self._bodies), None), self.simulation.outputs
         angular, linear = outputs["cvel"][:, rows].split(3, -1)
         self._things = BodyStates(outputs["xpos"][:, rows], outputs["xquat"][:, rows], linear, angular)
-        self._look_at(slice(1, None))  # seen together, they take little longer than the character alone
+        self._look_at(slice(1, None))  # together they take little longer than the character alone
         self._target, self._object = self._things.positions[:, 0], self._things.positions[:, -1]
         self._marks = mocap_positions(self.simulation.model).to(self.device)
 
@@ -142,7 +141,7 @@ class Transport(TransferTask):
         return mirror_signs([sign for size in self._shown.values() for sign in BODY_SIGNS[:size]])
 
     def reach(self) -> Reach:
-        """Returns of standing still, and of an ideal player who takes the object straight to its target."""
+        """Returns of standing still, and of an ideal player that takes the object straight to its target."""
 
         def reward(*state: Tensor) -> Tensor:
             left = torch.linalg.vector_norm(state[2] - state[4], dim=-1)
@@ -162,7 +161,7 @@ class Transport(TransferTask):
         return torch.linalg.vector_norm((self._object - self._target)[:, :2], dim=-1) < SUCCESS_DISTANCE
 
     def _extent(self, low: float, high: float) -> float:
-        """Furthest that the character extends at first from its root between two heights, all in metres."""
+        """Largest initial horizontal extent of the character from its root between two heights, all in metres."""
         return horizontal_extent(self.simulation.model, len(self._bodies), self.beginnings.poses(), low, high)
 
     def _sample(self, num: int) -> dict[str, Tensor]:
@@ -213,7 +212,7 @@ class Transport(TransferTask):
         return torch.stack([reward, emphasised - self._idle])
 
     def arrows(self, index: int) -> list[Arrow]:
-        """From above the character to the object, and from above the object to the target."""
+        """Arrows from above the character to the object, and from above the object to the target."""
         return [
             pointer(self._com[index], self._object[index]),
             pointer(self._object[index], self._target[index]),
@@ -221,7 +220,7 @@ class Transport(TransferTask):
 
 
 def goal_layout(things: Mapping[str, int]) -> dict[str, slice]:
-    """Where to find each quantity of things in the goal, of which each shows as many numbers."""
+    """Slices of the goal by body and quantity, from the number of entries of each body."""
     sizes = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
     layout, start = {}, 0
     for thing, shown in things.items():
@@ -234,27 +233,27 @@ def goal_layout(things: Mapping[str, int]) -> dict[str, slice]:
 
 
 def steps(distances: Tensor, directions: Tensor) -> Tensor:
-    """Displacements of some length in metres and direction in radians, ``(*B, 2)``."""
+    """Displacements ``(*B, 2)`` from lengths in metres and directions in radians."""
     return torch.stack([directions.cos(), directions.sin()], -1) * distances.unsqueeze(-1)
 
 
 def mocap_positions(model: mujoco.MjModel) -> Tensor:
-    """Where a model has its mocap bodies, ``(M, 3)``."""
+    """Positions of a model's mocap bodies, ``(M, 3)``."""
     return torch.from_numpy(model.body_pos[model.body_mocapid >= 0])
 
 
 def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low: float, high: float) -> float:
-    """How far a character extends horizontally from its root.
+    """Horizontal extent of a character from its root.
 
     Args:
         model: The scene, whose first bodies are the character's.
         num_bodies: Number of the character's bodies.
         poses: Coordinates of the character, ``(P, nq)``.
-        low: The lowest height that counts, in metres.
-        high: The highest.
+        low: Lowest height to include, in metres.
+        high: Highest height to include, in metres.
 
     Returns:
-        Radius in metres of the boxes around its shapes, the largest of all poses.
+        Largest radius in metres of the boxes around the character's shapes, over all poses.
     """
     data, radius = mujoco.MjData(model), 0.0
     own = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0))

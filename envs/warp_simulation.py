@@ -15,33 +15,33 @@ from torch import Tensor
 from torchrl_mcp.envs.simulation import CHANGING_FIELDS, GIVEN_FIELDS, LARGEST, Simulation
 
 DIVERGED = 1 << 30
-"""Bit of a fault that is no overflow."""
+"""Bit of a fault for divergence; the other bits are Warp's overflows."""
 
 GROUND_CONTACTS = {mujoco.mjtGeom.mjGEOM_SPHERE: 1, mujoco.mjtGeom.mjGEOM_CAPSULE: 2}
-"""Most contacts of a geom with a plane, where they are not four."""
+"""Maximum number of contacts of a geom with a plane; other types have four."""
 
 OTHER_CONTACTS = 8
-"""Room for contacts with other things than the ground, such as a ball or a box."""
+"""Additional contacts, with objects such as a ball or a box."""
 
 
 class WarpSimulation(Simulation):
     """A batch of N simulations stepped by MuJoCo Warp, see :class:`~torchrl_mcp.envs.simulation.Simulation`.
 
-    State and outputs are float32 views of Warp's memory; nothing is copied. Everything that a step launches is recorded
-    once as a graph: a CUDA graph on a GPU, and Warp's own on the CPU, which is there for tests.
+    State and outputs are float32 views of Warp's memory, without copies. The kernels of a step are recorded once as a
+    graph: a CUDA graph on a GPU, and Warp's own kind of graph on the CPU, which serves tests.
 
-    A simulation also faults where it has more contacts or constraints than there is room for.
+    A simulation also faults if it has more contacts or constraints than the allocated memory holds.
 
     Args:
         model: The compiled model; a copy is kept.
         num_envs: Number N of simulations.
-        device: Where to simulate.
+        device: Device of the simulation.
         substeps: Physics steps per call of :meth:`step`.
         outputs: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         model_fields: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         current: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
-        contacts: Contacts that there is room for, on average over all simulations; None for :func:`contact_room`.
-        constraints: Constraints that each simulation has room for; None for :func:`constraint_room` of the contacts.
+        contacts: Allocated contacts, on average over all simulations; None for :func:`contact_room`.
+        constraints: Allocated constraints of each simulation; None for :func:`constraint_room` of the contacts.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class WarpSimulation(Simulation):
         constraints: int | None = None,
     ) -> None:
         self.model, self.substeps, self.physics_seconds = copy.copy(model), substeps, 0.0
-        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp has none to switch off
+        self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp has no automatic reset
         self._current, self._model_fields = current, tuple(model_fields)
         wp.init()
         self._device, self._torch_device = wp.device_from_torch(device), device
@@ -67,8 +67,8 @@ class WarpSimulation(Simulation):
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(self.model, batch_sizes=dict.fromkeys(model_fields, num_envs))
             self._data = mjw.make_data(self.model, nworld=num_envs, nconmax=room, njmax=rows)
-        self._model.opt.warn_overflow = 0  # faults say it
-        # What loses contacts or constraints; a solver that has used up its iterations goes on with what it has.
+        self._model.opt.warn_overflow = 0  # faults report overflows
+        # Overflows that lose contacts or constraints. A solver that reaches its maximum of iterations is no fault.
         overflow = mjw.OverflowType
         self._lost = int(overflow.ALL & ~(overflow.ITERATIONS | overflow.LS_ITERATIONS))
         self._shared = int(overflow.BROADPHASE | overflow.NARROWPHASE)
@@ -89,7 +89,7 @@ class WarpSimulation(Simulation):
         """See :meth:`Simulation.step`.
 
         Raises:
-            RuntimeError: If there was no room for the contacts of all simulations, so that any of them may lack some.
+            RuntimeError: If the shared memory for contacts was too small, so that any simulation may lack contacts.
         """
         self._controls.copy_(ctrl)
         self._run(self._step)
@@ -113,7 +113,7 @@ class WarpSimulation(Simulation):
         return self._forces
 
     def data(self, index: int) -> mujoco.MjData:
-        """See :meth:`Simulation.data`: by MuJoCo itself, of this state."""
+        """See :meth:`Simulation.data`: MuJoCo computes it from the state."""
         model = copy.copy(self.model)
         data = mujoco.MjData(model)
         for name, field in self.state.items():
@@ -126,7 +126,7 @@ class WarpSimulation(Simulation):
         return data
 
     def _make_graphs(self, num_envs: int) -> None:
-        """Record what is launched again and again."""
+        """Record the graphs of a step, of the outputs and of the contact forces."""
         with wp.ScopedDevice(self._device):
             arrays = [self._arrays[name] for name in CHANGING_FIELDS if name in self._arrays]
             self._changing = [(array, wp.empty_like(array)) for array in arrays]
@@ -139,7 +139,7 @@ class WarpSimulation(Simulation):
         self._run(self._outputs)
 
     def _recorded(self, work: Callable[[], None]) -> Callable[[], None]:
-        """Return what does some work again, as one graph where the device has them."""
+        """Return a function that repeats some work, as one graph if the device supports graphs."""
         work()  # compiles the kernels, or loads them from the cache
         if self._device.is_cuda and not wp.is_mempool_enabled(self._device):
             return work
@@ -148,7 +148,7 @@ class WarpSimulation(Simulation):
         return partial(wp.capture_launch, capture.graph)
 
     def _run(self, work: Callable[[], None]) -> None:
-        """Do recorded work, on the stream on which torch works, and count the time that it takes to launch it."""
+        """Launch recorded work on torch's stream, and add the time of launching to ``physics_seconds``."""
         start = time.perf_counter()
         with wp.ScopedDevice(self._device):
             if self._device.is_cuda:
@@ -159,7 +159,7 @@ class WarpSimulation(Simulation):
         self.physics_seconds += time.perf_counter() - start
 
     def _advance(self) -> None:
-        """Take the physics steps of an action, and take them back where they fault."""
+        """Take the physics steps of an action, and undo them in simulations that fault."""
         data, faults, worlds = self._data, self._faulted, self._data.nworld
         for now, before in self._changing:
             wp.copy(before, now)
@@ -167,7 +167,8 @@ class WarpSimulation(Simulation):
         for _ in range(self.substeps):
             mjw.step(self._model, data)
         wp.launch(_note_overflows, worlds, inputs=[data.overflow, self._lost], outputs=[faults])
-        # Where float32 ends, Warp's solver gives up and leaves no acceleration: without constraints it would be large.
+        # Beyond the range of float32, Warp's solver fails and leaves zero accelerations. The unconstrained acceleration
+        # qacc_smooth is large then, so it is checked too.
         for values in (self._asked, data.qacc_smooth, *(now for now, _ in self._changing)):
             wp.launch(_note_divergences, worlds, inputs=[_rows(values), LARGEST, DIVERGED], outputs=[faults])
         for now, before in self._changing:
@@ -177,17 +178,17 @@ class WarpSimulation(Simulation):
             self._compute_outputs()
 
     def _compute_outputs(self) -> None:
-        """Compute what follows from positions and velocities."""
+        """Compute the outputs, which depend on positions and velocities."""
         mjw.kinematics(self._model, self._data)
         mjw.com_pos(self._model, self._data)
         mjw.com_vel(self._model, self._data)
         if self.model.nsensordata:
-            mjw.collision(self._model, self._data)  # distances are sensed by way of contacts
+            mjw.collision(self._model, self._data)  # distance sensors read the contacts
             self._data.sensordata.zero_()
             mjw.sensor_pos(self._model, self._data)
 
     def _bring_up_to_date(self, ids: Tensor) -> None:
-        """Compute the outputs of some simulations; those of the others stay as they are."""
+        """Compute the outputs of some simulations without changing those of the others."""
         others = {} if self._current else {name: value.clone() for name, value in self.outputs.items()}
         self._run(self._outputs)
         for name, before in others.items():
@@ -195,7 +196,7 @@ class WarpSimulation(Simulation):
             after.copy_(before.index_copy(0, ids, after[ids]))
 
     def _require_room(self, fault: int) -> None:
-        """Check that a fault is not one of all simulations, whose contacts share their room."""
+        """Check that a fault is not an overflow of the memory that all simulations share for contacts."""
         if fault & self._shared:
             raise RuntimeError(
                 f"{self._data.nworld} simulations have more contacts than the {self._data.naconmax} that there is room "
@@ -204,10 +205,10 @@ class WarpSimulation(Simulation):
 
 
 def contact_room(model: mujoco.MjModel) -> int:
-    """Contacts that each simulation should have room for.
+    """Return the number of contacts to allocate for each simulation.
 
-    Half of those that all that can touch the ground could have with it, and eight more. Of the library's scenes, with
-    characters that flail and lie about, none has more than 0.6 times as many.
+    This is half of the contacts that all geoms could have with the ground, and eight more. In random falls of the
+    library's characters, no measured scene had more than 0.6 times this number.
     """
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     kinds = model.geom_type[touching & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)]
@@ -215,7 +216,7 @@ def contact_room(model: mujoco.MjModel) -> int:
 
 
 def constraint_room(model: mujoco.MjModel, contacts: int) -> int:
-    """Constraints of as many contacts, with all joints at their limits and all that equalities may hold."""
+    """Return the number of constraints of ``contacts``, of all joints at their limits and of all equalities."""
     dimensions = int(model.geom_condim.max())
     rows = 2 * (dimensions - 1) if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL else dimensions
     limits, frictions = int(model.jnt_limited.sum()), int((model.dof_frictionloss > 0).sum())
@@ -224,7 +225,7 @@ def constraint_room(model: mujoco.MjModel, contacts: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def _note_overflows(overflows: wp.array[int], lost: int, faults: wp.array[int]) -> None:
-    """Begin faults with the overflows of the steps just made, and forget these."""
+    """Set the faults to the overflows of the last steps, and clear the overflows."""
     world = wp.tid()
     faults[world] = overflows[world] & lost
     overflows[world] = 0
@@ -232,7 +233,7 @@ def _note_overflows(overflows: wp.array[int], lost: int, faults: wp.array[int]) 
 
 @wp.kernel(enable_backward=False)
 def _note_divergences(values: wp.array2d[float], largest: float, diverged: int, faults: wp.array[int]) -> None:
-    """Add the simulations with values that are no numbers below the largest: a NaN compares false."""
+    """Add a fault to simulations with values that are NaN or not below the largest: a NaN compares false."""
     world = wp.tid()
     for column in range(values.shape[1]):
         if not (wp.abs(values[world, column]) < largest):
@@ -241,18 +242,18 @@ def _note_divergences(values: wp.array2d[float], largest: float, diverged: int, 
 
 @wp.kernel(enable_backward=False)
 def _take_back(faults: wp.array[int], before: wp.array2d[float], values: wp.array2d[float]) -> None:
-    """Restore values where there is a fault."""
+    """Restore the earlier values of simulations with a fault."""
     world, column = wp.tid()
     if faults[world] != 0:
         values[world, column] = before[world, column]
 
 
 def _rows(array: Any) -> Any:
-    """An array with a row of numbers for each simulation."""
+    """Return an array as a matrix with one row per simulation."""
     return array if array.ndim == 2 else array.reshape((array.shape[0], -1))
 
 
 def _view(array: Any) -> Tensor:
-    """An array as a tensor with the shape of MuJoCo's: matrices are rows of nine numbers."""
+    """Return an array as a tensor in MuJoCo's shape, in which a matrix is a row of nine numbers."""
     tensor = wp.to_torch(array)
     return tensor.flatten(-2) if array.dtype is wp.mat33 else tensor

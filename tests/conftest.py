@@ -1,8 +1,15 @@
 import os
+import sys
+import traceback
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
 
 # Small tensors: a thread pool costs more than it gives, and results must not depend on the machine's cores.
@@ -23,3 +30,39 @@ def mocap() -> Path:
     if not Path(folder).is_dir():
         pytest.fail(f"TORCHRL_MCP_MOCAP={folder!r} is not a folder: correct it, or unset it to skip these tests")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def command():
+    """Call a command as a shell would, but in this process, which has imported PyTorch: ``command("train", "seed=1")``.
+
+    What it leaves in Python's global state is undone.
+    """
+
+    def call(name, *arguments, cwd="."):
+        words = [f"torchrl-mcp-{name}", *map(str, arguments)]
+        output, errors = StringIO(), StringIO()
+        threads = torch.get_num_threads()
+        with pytest.MonkeyPatch.context() as patch, chdir(cwd), redirect_stdout(output), redirect_stderr(errors):
+            patch.setattr(sys, "argv", words)
+            patch.setattr(HydraConfig.instance(), "cfg", None)
+            code = _exit_code(import_module(f"torchrl_mcp.cli.{name}").main)
+        torch.set_num_threads(threads)
+        return CompletedProcess(words, code, output.getvalue(), errors.getvalue())
+
+    return call
+
+
+def _exit_code(main):
+    """Return what a process that ran the function would end with, after printing what Python would print."""
+    try:
+        main()
+    except SystemExit as stop:
+        if isinstance(stop.code, str):
+            print(stop.code, file=sys.stderr)
+            return 1
+        return stop.code or 0
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0

@@ -3,23 +3,36 @@
 import csv
 import importlib.util
 import runpy
-import subprocess
 import sys
 from itertools import product
 from pathlib import Path
 
 import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from torchrl_mcp.runs import experiment, policies
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ABOUT = {"commit", "date", "processor", "instructions", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
 
 
 def run(script, output, *arguments):
-    command = [sys.executable, BENCHMARKS / script, "--quick", "--threads", "1", "--output", output, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=output.parent)
-    assert done.returncode == 0, done.stderr
+    """Run a script in this process, which has imported PyTorch, and return the rows that it writes."""
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        patch.chdir(output.parent)
+        patch.setattr(sys, "argv", [script, *map(str, arguments), "--quick", "--output", str(output)])
+        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
+    torch.set_num_threads(threads)
     with output.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+        return list(csv.DictReader(file))
+
+
+def measured(script, output, *arguments):
+    """The same of a script that measures: its rows describe the machine."""
+    rows = run(script, output, "--threads", "1", *arguments)
     assert set(rows[0]) >= ABOUT
     return rows
 
@@ -27,7 +40,7 @@ def run(script, output, *arguments):
 @pytest.fixture(scope="module")
 def training(tmp_path_factory):
     """Rows by contender."""
-    rows = run("training_throughput.py", tmp_path_factory.mktemp("training") / "out.csv")
+    rows = measured("training_throughput.py", tmp_path_factory.mktemp("training") / "out.csv")
     return {row["contender"]: row for row in rows}
 
 
@@ -56,47 +69,29 @@ def test_stable_baselines3_is_left_out_and_named_where_it_is_not_installed(monke
 
 
 def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):
-    output = tmp_path / "out.csv"
-    subprocess.run([sys.executable, BENCHMARKS / "ideal.py", "--quick", "--output", output], check=True, cwd=tmp_path)
-    with output.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = run("ideal.py", tmp_path / "out.csv")
     assert {row["task"] for row in rows} == {"heading", "carry", "dribble", "holdout"}
     assert all(0 < float(row["standing"]) < float(row["ideal"]) <= 1 for row in rows)
 
 
-@pytest.fixture
-def soak(tmp_path, monkeypatch):
-    """Run a part of the soak in this process, and give its rows."""
-
-    def run(what):
-        monkeypatch.syspath_prepend(BENCHMARKS)
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["soak.py", what, "--quick", "--output", str(tmp_path / "out.csv")])
-        runpy.run_path(str(BENCHMARKS / "soak.py"))["main"]()
-        with (tmp_path / "out.csv").open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    return run
-
-
-def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(soak):
-    rows = soak("flips")
+def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(tmp_path):
+    rows = run("soak.py", tmp_path / "out.csv", "flips")
     assert [row["check"] for row in rows] == ["resume", "evaluate"]
     for row in rows:
         assert int(row["refused"]) > 0
         assert int(row["refused"]) + int(row["harmless"]) == int(row["flips"]) == 20
 
 
-def test_the_soak_acts_unfitly_in_every_task_and_all_that_comes_of_it_is_an_end_of_the_episode(soak):
-    rows = soak("steps")
+def test_the_soak_acts_unfitly_in_every_task_and_all_that_comes_of_it_is_an_end_of_the_episode(tmp_path):
+    rows = run("soak.py", tmp_path / "out.csv", "steps")
     assert len({(row["task"], row["character"]) for row in rows}) == 13
     assert sum(int(row["unfit"]) for row in rows) > 30
     assert all(row["missed"] == row["not_finite"] == "0" for row in rows)
 
 
 @pytest.mark.slow
-def test_the_soak_kills_runs_and_fills_their_disk_and_what_comes_of_them_is_what_nobody_disturbed(soak):
-    rows = soak("training")
+def test_the_soak_kills_runs_and_fills_their_disk_and_what_comes_of_them_is_what_nobody_disturbed(tmp_path):
+    rows = run("soak.py", tmp_path / "out.csv", "training")
     assert [row["collector"] for row in rows] == ["local", "processes"]
     for row in rows:
         assert int(row["killed"]) > 0
@@ -106,7 +101,7 @@ def test_the_soak_kills_runs_and_fills_their_disk_and_what_comes_of_them_is_what
 
 
 def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
-    rows = run("primitive_reuse.py", tmp_path / "out.csv")
+    rows = measured("primitive_reuse.py", tmp_path / "out.csv")
     pairs = [(row["character"], row["precision"]) for row in rows]
     assert pairs == [("ant", "fp32"), ("ant", "bf16"), ("humanoid", "fp32"), ("humanoid", "bf16")]
     for row in rows:
@@ -117,7 +112,7 @@ def test_primitive_reuse_is_measured_for_every_size_and_precision(tmp_path):
 
 @pytest.mark.parametrize("what", ["timestep", "stress"])
 def test_characters_are_measured(tmp_path, what):
-    rows = run("characters.py", tmp_path / "out.csv", what, "--characters", "biped")
+    rows = measured("characters.py", tmp_path / "out.csv", what, "--characters", "biped")
     assert {row["character"] for row in rows} == {"biped"}
     if what == "timestep":
         assert all(0 < float(row["smooth"]) < 0.1 for row in rows)
@@ -126,7 +121,7 @@ def test_characters_are_measured(tmp_path, what):
 
 
 def test_legs_are_measured_in_the_corpus_and_as_the_built_in_network_moves_them(tmp_path):
-    rows = run("legs_apart.py", tmp_path / "out.csv", "--characters", "biped")
+    rows = measured("legs_apart.py", tmp_path / "out.csv", "--characters", "biped")
     assert [row["motion"] for row in rows] == ["generated corpus", "built-in network"]
     for row in rows:
         assert int(row["frames"]) > 10
@@ -135,7 +130,7 @@ def test_legs_are_measured_in_the_corpus_and_as_the_built_in_network_moves_them(
 
 
 def test_tasks_are_measured_beside_bare_mujoco(tmp_path):
-    rows = run("task_throughput.py", tmp_path / "out.csv", "--tasks", "Heading", "--characters", "biped")
+    rows = measured("task_throughput.py", tmp_path / "out.csv", "--tasks", "Heading", "--characters", "biped")
     (row,) = rows
     assert float(row["of_raw"]) > 0
     assert 0 < float(row["physics"]) < 1
@@ -159,3 +154,28 @@ def test_the_model_of_scaling_finds_the_constants_that_made_the_times_and_predic
     assert scaling["predict"](256, 4, False, found, linear=False) == pytest.approx(1 / seconds, rel=1e-3)
     seconds += 1e-4 / 2.5 - 1e-4 * (1 / 3 + 2 / 3 / 4)
     assert scaling["predict"](256, 4, False, found, linear=True) == pytest.approx(1 / seconds, rel=1e-3)
+
+
+def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_path, monkeypatch):
+    settings = ["method=mcp", "character=biped", "task=dribble", "stage=transfer", "pretrained=builtin", "preset=smoke"]
+    settings += ["width=1", "gating.network.width=0.1", "critic.width=0.1"]
+    settings += ["logger=none", "progress_bar=false", "num_threads=1", "checkpoint_interval=1", "evaluation.episodes=0"]
+    settings += ["training.total_frames=256", "keep_checkpoints=9", "task.evaluation.max_episode_steps=4"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        for name in ("printed", "shaping"):
+            experiment.train(compose("train", [*settings, f"practice={name}", f"run_dir={tmp_path / 'runs' / name}"]))
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.setattr(
+        sys, "argv", ["practice.py", str(tmp_path / "runs"), "--episodes", "3", "--output", str(tmp_path)]
+    )
+    runpy.run_path(str(BENCHMARKS / "practice.py"), run_name="__main__")
+    with (tmp_path / "practice.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["practice"], row["steps"]) for row in rows] == list(product(("printed", "shaping"), ("128", "256")))
+    cfg = policies.policy_config(tmp_path / "runs" / "shaping")
+    found = policies.evaluate_run(
+        tmp_path / "runs" / "shaping", episodes=3, seed=cfg.evaluation.seed, **cfg.evaluation.environment
+    )["deterministic"]
+    assert float(rows[-1]["normalised_return"]) == pytest.approx(found["normalised_return"], abs=1e-4)
+    assert float(rows[-1]["success"]) == found["metrics"]["success"]
+    assert (tmp_path / "practice_dribble.png").exists()

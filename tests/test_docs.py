@@ -31,13 +31,15 @@ BLOCK = re.compile(r"^```(python|pycon)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"^```\{code-block\} \w+\n:caption: (.*?)\n\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 COMMAND = re.compile(r"^(?:PYTHONPATH=\. )?torchrl-mcp-train ((?:.*\\\n)*.*)$", re.MULTILINE)
 INCLUDE = re.compile(r"```\{include\} (\S+)\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]+))?\)")
 
 EVERYTHING = (
     "method=mcp task=holdout",
     "method=mcp task=imitation character=biped",
     "method=mcp task=heading character=biped stage=transfer",
     "method=mcp task=carry character=biped stage=transfer",
-    "method=mcp exploration=weights stage=transfer",
+    "method=mcp exploration=correlated_weights stage=transfer",
     "method=mcp preset=paper",
     "method=hierarchical task=heading character=biped stage=transfer",
     "method=option_critic task=imitation character=biped",
@@ -142,6 +144,25 @@ def test_what_a_page_includes_of_another_is_there(page):
         lines = (page.parent / path).read_text().splitlines()
         for text in re.findall(r':(?:start-after|end-before): "(.*)"', options):
             assert text in lines, (path, text)
+
+
+def headings(page):
+    """Anchors of the headings of a page and its included pages, as GitHub and MyST form them."""
+    text = INCLUDE.sub(lambda match: (page.parent / match[1]).read_text(), page.read_text())
+    titles = re.findall(r"^#+ (.*)$", FENCE.sub("", text), re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "README.md", *pages_with(LINK)],
+    ids=lambda path: f"{path.parent.name}/{path.stem}",
+)
+def test_every_link_leads_to_a_file_and_to_a_single_heading_of_it(page):
+    for path, anchor in LINK.findall(FENCE.sub("", page.read_text())):
+        target = page.parent / path if path else page
+        assert target.exists(), path
+        assert not anchor or headings(target).count(anchor) == 1, (path, anchor)
 
 
 def test_every_module_has_its_place_in_the_reference():

@@ -13,7 +13,7 @@ import torchrl_mcp
 from torchrl_mcp import conf
 from torchrl_mcp.report.comparison import choices
 from torchrl_mcp.report.results import read_run
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.transfer import fingerprint
 
@@ -29,6 +29,7 @@ def place(file):
 FILES = sorted((Path(conf.__file__).parent / "method").glob("*.yaml"))
 CASES = {file.stem: (file.stem, place(file)) for file in FILES}
 CASES["finetune to the same goal"] = ("finetune", ANT)
+CASES["mcp with correlated noise"] = ("mcp", (ANT[0], [*ANT[1], "exploration=correlated_weights"]))
 
 SMALL = [
     "training.frames_per_batch=64",
@@ -51,7 +52,7 @@ def rows(folder):
 
 
 def fingerprints(folder):
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
     return {name: fingerprint(part) for name, part in agent.parts.items()}
 
 
@@ -72,7 +73,7 @@ def runs(request, tmp_path_factory):
 
 def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_freeze(runs):
     pretrained, transferred = runs
-    cfg, agent, env = experiment.restore(transferred, num_envs=1, seed=0)
+    cfg, agent, env = policies.restore(transferred, num_envs=1, seed=0)
     after = {name: fingerprint(part) for name, part in agent.parts.items()}
     file = checkpoint.find(pretrained) if pretrained else None
     start = {name: fingerprint(part) for name, part in build.make_agent(cfg, env, file).parts.items()}
@@ -94,12 +95,12 @@ def test_a_resumed_transfer_continues_to_the_same_numbers(runs, tmp_path):
 
 
 def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs):
-    results = experiment.evaluate_run(runs[1], episodes=3, seed=0, max_episode_steps=5)
+    results = policies.evaluate_run(runs[1], episodes=3, seed=0, max_episode_steps=5)
     for numbers in results.values():
         assert 1 <= numbers["length"] <= 5
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
     assert results["deterministic"]["return"] != results["stochastic"]["return"]
-    _, agent, _ = experiment.restore(runs[1], num_envs=1, seed=0)
+    _, agent, _ = policies.restore(runs[1], num_envs=1, seed=0)
     found = results["stochastic"]["diagnostics"]
     for key, name in {"gates": "gates/effective_primitives", "begins": "options/effective_options"}.items():
         assert (name in found) == (key in agent.actor.stored)

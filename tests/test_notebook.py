@@ -37,7 +37,7 @@ def test_it_is_stored_without_outputs():
 def test_stock_ppo_trains_the_composition(names):
     assert len(names["returns"]) == 2
     assert all(math.isfinite(value) for value in names["returns"])
-    assert names["gates"].shape == (200, 4)
+    assert names["gates"].shape == (10, 200, 4)
 
 
 def test_the_t_rex_follows_its_reference(names):

@@ -28,12 +28,14 @@ def called(tmp_path_factory):
     folder, outcomes = tmp_path_factory.mktemp("tutorial"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(sys, "path", list(sys.path))  # commands add the working directory
+        path = list(sys.path)
         for code in PYTHON.findall(TUTORIAL):
             exec(compile(code, "character.md", "exec"), {})
         for program, arguments in COMMAND.findall(TUTORIAL):
             if program == "torchrl-mcp-play" and opengl._platform() is None:
                 continue
+            forget()  # each command has a process of its own
+            patch.setattr(sys, "path", list(path))
             patch.setattr(sys, "argv", shlex.split(f"{program} {arguments} {SMALLER.get(program, '')}"))
             try:
                 PROGRAMS[program].main()
@@ -42,6 +44,11 @@ def called(tmp_path_factory):
                 code = stop.code
             outcomes.append((f"{program} {arguments}", code))
         yield folder, outcomes
+    forget()
+
+
+def forget():
+    """Remove the tutorial's module and character from this process."""
     sys.modules.pop("gymnast", None)
     CHARACTERS.pop("gymnast", None)
 

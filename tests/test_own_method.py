@@ -11,7 +11,7 @@ import pytest
 
 import torchrl_mcp
 from torchrl_mcp.cli import evaluate, figures, report, train
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.trust import trusting
 
 TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorials" / "method.md"
@@ -36,15 +36,18 @@ def folder(tmp_path_factory):
     text = TUTORIAL.read_text()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.syspath_prepend(folder)
+        path = list(sys.path)
         for name, content in FILE.findall(text):
             Path(name).parent.mkdir(parents=True, exist_ok=True)
             Path(name).write_text(content)
         for program, arguments in COMMAND.findall(text):
             line = f"{program} {arguments}"
             smaller = next((words for start, words in SMALLER.items() if line.startswith(start)), "")
+            sys.modules.pop("own_methods", None)  # each command has a process of its own
+            patch.setattr(sys, "path", list(path))
             patch.setattr(sys, "argv", shlex.split(f"{line} {smaller}"))
             PROGRAMS[program].main()
+        patch.syspath_prepend(folder)
         yield folder
     sys.modules.pop("own_methods", None)
 
@@ -63,7 +66,7 @@ def test_the_methods_are_not_the_librarys(folder):
 
 def test_of_the_weights_the_three_largest_stay(folder):
     with trusting({"own_methods"}):
-        _, agent, env = experiment.restore(folder / "runs" / "top-new", num_envs=5, seed=0)
+        _, agent, env = policies.restore(folder / "runs" / "top-new", num_envs=5, seed=0)
     gates = env.rollout(10, agent.actor.policy)["gates"]
     assert ((gates > 0).sum(-1) == 3).all()
     diagnostics = json.loads((folder / "evaluation.json").read_text())["deterministic"]["diagnostics"]
@@ -72,8 +75,8 @@ def test_of_the_weights_the_three_largest_stay(folder):
 
 def test_the_temperature_is_learned_at_transfer_while_the_primitives_stay(folder):
     with trusting({"own_methods"}):
-        _, before, _ = experiment.restore(folder / "runs" / "tempered", num_envs=1, seed=0)
-        _, after, _ = experiment.restore(folder / "runs" / "tempered-new", num_envs=1, seed=0)
+        _, before, _ = policies.restore(folder / "runs" / "tempered", num_envs=1, seed=0)
+        _, after, _ = policies.restore(folder / "runs" / "tempered-new", num_envs=1, seed=0)
     assert before.parts["gating"].log_temperature.item() != after.parts["gating"].log_temperature.item() != 0.0
     kept = after.parts["primitives"].state_dict()
     assert all((value == kept[name]).all() for name, value in before.parts["primitives"].state_dict().items())
@@ -103,9 +106,9 @@ def test_without_the_folder_on_the_path_the_remedy_is_named(folder, monkeypatch)
         pytest.raises(ValueError, match=r"own_methods\S+, which Python does not find: .* add its folder to PYTHONPATH"),
         trusting({"own_methods"}),
     ):
-        experiment.restore(folder / "runs" / "top", num_envs=1, seed=0)
+        policies.restore(folder / "runs" / "top", num_envs=1, seed=0)
 
 
 def test_what_is_not_trusted_is_not_built_and_the_remedy_is_named(folder):
     with pytest.raises(ValueError, match=r"would run own_methods\.\S+, .* pass --trust own_methods"):
-        experiment.restore(folder / "runs" / "top", num_envs=1, seed=0)
+        policies.restore(folder / "runs" / "top", num_envs=1, seed=0)

@@ -36,8 +36,3 @@ def test_the_loss_of_the_stock_agent_reaches_every_parameter_of_its_actor():
     sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
     for name, parameter in names["actor"].named_parameters():
         assert parameter.grad.abs().sum() > 0, name
-
-
-def test_every_file_that_the_readme_points_to_exists():
-    for path in re.findall(r"\]\((?!https?:)([^)#]+)\)", README):
-        assert (ROOT / path).exists(), path

@@ -1,4 +1,4 @@
-"""Bodies as MuJoCo simulates them, without any task."""
+"""Simulated bodies in MuJoCo, without tasks."""
 
 from torchrl_mcp.envs.characters.ant import ant
 from torchrl_mcp.envs.characters.biped import BIPED

@@ -1,4 +1,4 @@
-"""A character from a body that was made for something else."""
+"""Converting bodies that were made for other purposes into characters."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,16 +9,16 @@ import numpy as np
 from torchrl_mcp.envs.characters.contract import BALL, FREE, HINGE, colliding, joints_of, kinds_of, lowest_bodies
 
 TIMESTEP = 1 / 120
-"""Seconds of physics."""
+"""Seconds of a physics step."""
 
 LIMIT_ANGLE = 0.4
-"""Radians from its target at which a joint's torque reaches its limit, as at the biped's hip."""
+"""Distance in radians from its target at which a joint's torque reaches its limit, as at the biped's hip."""
 
 BEYOND = 1.2
-"""Targets may lie beyond the limits of a joint, at this multiple of them."""
+"""Factor on the limits of a joint that defines the range of its targets."""
 
 DEFAULT_RANGE = (-1.57, 1.57)
-"""Radians, of a joint without limits."""
+"""Range in radians of a joint without limits."""
 
 KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -27,17 +27,17 @@ KINDS = {
     mujoco.mjtGeom.mjGEOM_CYLINDER: mujoco.mjtGeom.mjGEOM_CAPSULE,
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: mujoco.mjtGeom.mjGEOM_BOX,
 }
-"""The shape that stands for each."""
+"""The shape that replaces each shape."""
 
 
 class Gains(NamedTuple):
-    """What drives a joint.
+    """Parameters of a joint's drive.
 
     Args:
-        torque: Its limit, in N m.
-        stiffness: In N m/rad.
-        damping: In N m s/rad: three quarters in the actuator, a quarter in the joint.
-        armature: In kg m^2, so that a light limb does not chatter between the limits of the torque.
+        torque: Limit of the torque, in N m.
+        stiffness: Stiffness in N m/rad.
+        damping: Damping in N m s/rad: three quarters in the actuator, a quarter in the joint.
+        armature: Armature in kg m^2, so that a light limb does not chatter between the limits of the torque.
     """
 
     torque: float
@@ -47,18 +47,18 @@ class Gains(NamedTuple):
 
 
 def adapted(model: mujoco.MjModel) -> mujoco.MjSpec:
-    """Return a body that keeps the contract of a :class:`~torchrl_mcp.envs.characters.Character`, as far as can be.
+    """Return a body that meets the contract of a :class:`~torchrl_mcp.envs.characters.Character`, as far as possible.
 
     Floor, lights, cameras, tendons and sensors are left out; cylinders become capsules and ellipsoids boxes. Several
     hinges of a body become a ball joint, whose targets have the ranges of the hinges about each axis. Motors become
-    position servos of their torque limits; a joint without a motor gets its limit from the masses that it moves. The
-    root is set on the ground. Masses and inertias stay.
+    position servos with the same torque limits; the limit of a joint without a motor comes from the masses that it
+    moves. The body is put on the ground. Masses and inertias stay the same.
 
     Args:
         model: The body in its scene, compiled.
 
     Raises:
-        ValueError: If the body has no single root with a free joint, a joint that slides, or a mesh that collides.
+        ValueError: If the body has not one root with a free joint, or has a slide joint or a colliding mesh.
     """
     _require_convertible(model)
     spec = mujoco.MjSpec()
@@ -85,7 +85,7 @@ def adapted(model: mujoco.MjModel) -> mujoco.MjSpec:
 
 
 def key_bodies(model: mujoco.MjModel) -> list[str]:
-    """Return the bodies at the ends of the limbs, whose positions say most about a pose."""
+    """Return the bodies at the ends of the limbs, whose positions best describe a pose."""
     parents = set(model.body_parentid.tolist())
     return [model.body(body).name for body in range(2, model.nbody) if body not in parents]
 
@@ -105,7 +105,7 @@ def _require_convertible(model: mujoco.MjModel) -> None:
 
 
 def _add_joint(spec: mujoco.MjSpec, target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: int) -> None:
-    """Give a body its joint and the actuators of that."""
+    """Add a body's joint and its actuators."""
     joints, kinds = joints_of(model, body), kinds_of(model, body)
     if kinds == [FREE]:
         target.add_freejoint(name=name)
@@ -146,7 +146,7 @@ def _add_servo(
 
 
 def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> None:
-    """Give a body its shapes; what only decorates it and is no such shape is left out."""
+    """Add a body's shapes; decorative shapes of other kinds are left out."""
     for geom in np.flatnonzero(model.geom_bodyid == body):
         kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom].copy()
         if kind not in KINDS:
@@ -168,24 +168,24 @@ def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> Non
 
 
 def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
-    """Limits of a joint, in radians, widened to hold the rest pose."""
+    """Limits of a joint in radians, widened to contain the rest pose."""
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else DEFAULT_RANGE
     return min(float(low), 0.0), max(float(high), 0.0)
 
 
 def _ball_ranges(model: mujoco.MjModel, hinges: Sequence[int]) -> np.ndarray:
-    """Range of the turn about x, y and z that several hinges allow, to first order, ``(3, 2)`` in radians."""
+    """Ranges of rotation about x, y and z for several hinges, to first order, ``(3, 2)`` in radians."""
     ranges = np.zeros((3, 2))
     for hinge in hinges:
         ends = np.outer(model.jnt_axis[hinge], _range(model, hinge))
         ranges += np.sort(ends, axis=1)
-    narrow = ranges[:, 1] - ranges[:, 0] < 0.2  # about an axis that no hinge had there is a little play
+    narrow = ranges[:, 1] - ranges[:, 0] < 0.2  # a small range about axes without a hinge
     ranges[narrow] = [-0.1, 0.1]
     return ranges
 
 
 def _gains(model: mujoco.MjModel, body: int) -> Gains:
-    """What drives the joint of a body."""
+    """Parameters of the drive of a body's joint."""
     torque = max((_motor_torque(model, joint) for joint in joints_of(model, body)), default=0.0)
     torque = torque or _torque_of_masses(model, body)
     stiffness = torque / LIMIT_ANGLE
@@ -194,7 +194,7 @@ def _gains(model: mujoco.MjModel, body: int) -> Gains:
 
 
 def _motor_torque(model: mujoco.MjModel, joint: int) -> float:
-    """Largest torque of the actuators of a joint, in N m, 0 if nothing tells."""
+    """Largest torque of the actuators of a joint, in N m, 0 if unknown."""
     torque = 0.0
     for index in np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0)):
         force = abs(model.actuator_forcerange[index]).max() if model.actuator_forcelimited[index] else 0.0
@@ -205,7 +205,7 @@ def _motor_torque(model: mujoco.MjModel, joint: int) -> float:
 
 
 def _torque_of_masses(model: mujoco.MjModel, body: int) -> float:
-    """Torque that holds the lighter side of a joint level, three times over, in N m."""
+    """Three times the torque that holds the lighter side of a joint level, in N m."""
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     mass, total = model.body_subtreemass[body], model.body_subtreemass[1]

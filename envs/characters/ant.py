@@ -8,7 +8,7 @@ import mujoco
 def ant() -> mujoco.MjSpec:
     """The ant of Gymnasium's Ant-v5, read from the installed Gymnasium: 14 degrees of freedom, 8 motors.
 
-    Its floor and light come with it. Physics runs at 100 Hz; Gymnasium acts on every fifth step.
+    The file includes floor and light. Physics runs at 100 Hz; Gymnasium acts on every fifth step.
 
     Reference:
         Schulman et al., High-Dimensional Continuous Control Using Generalized Advantage Estimation, 2015;

@@ -1,4 +1,4 @@
-"""The description of a body, with what its MuJoCo file cannot hold."""
+"""The description of a body, with facts that its MuJoCo file cannot hold."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ class Character:
     ``contype=0 conaffinity=1``: they collide with a scene whose shapes have ``contype=1``, not with one another.
 
     Args:
-        name: Of the character and of its file.
+        name: Name of the character and of its file.
         feet: Bodies that may touch the ground.
-        key_bodies: Bodies whose positions say most about a pose: head, hands, feet.
-        carrier: Body that picks up the box of the carry task, or None for a character that cannot.
-        file: Its MJCF file; None is the library's own of that name.
+        key_bodies: Bodies whose positions best describe a pose: head, hands, feet.
+        carrier: Body that picks up the box of the carry task, or None if there is none.
+        file: MJCF file; None for the library's file of that name.
     """
 
     name: str
@@ -35,10 +35,10 @@ class Character:
     file: Path | None = None
 
     def spec(self, *, self_collision: bool = False) -> mujoco.MjSpec:
-        """Return the body, to be put into a scene.
+        """Return the body, for a scene.
 
         Args:
-            self_collision: Let its bodies collide with one another, but for those that a joint connects.
+            self_collision: Let its bodies collide with one another, except bodies that a joint connects.
         """
         own = nullcontext(self.file) if self.file else as_file(files(__package__) / f"{self.name}.xml")
         with own as path:
@@ -49,6 +49,6 @@ class Character:
         return spec
 
     def check(self) -> list[Violation]:
-        """Return where the body violates what is said above of its file, each with its remedy; none, if nowhere."""
+        """Return the body's violations of the contract above, each with its remedy; empty if there are none."""
         model = self.spec().compile()
         return violations(model, feet=self.feet, key_bodies=self.key_bodies, carrier=self.carrier)

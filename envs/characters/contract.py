@@ -1,4 +1,4 @@
-"""Where a body violates the contract of a :class:`~torchrl_mcp.envs.characters.Character`, and what to do about it."""
+"""Checks of the contract of a :class:`~torchrl_mcp.envs.characters.Character`, with remedies."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 SOLE = 0.005
-"""Metres by which the lowest point may miss the ground."""
+"""Largest distance in metres of the lowest point from the ground."""
 
 CONTROL_TIMESTEP = 1 / 30
 """Seconds per action."""
@@ -23,8 +23,8 @@ class Violation(NamedTuple):
     """A violation of the contract.
 
     Args:
-        finding: What is wrong.
-        remedy: What to do.
+        finding: Description of the violation.
+        remedy: Instruction for the user.
     """
 
     finding: str
@@ -38,13 +38,13 @@ class Violation(NamedTuple):
 def violations(
     model: mujoco.MjModel, *, feet: Sequence[str], key_bodies: Sequence[str] = (), carrier: str | None = None
 ) -> list[Violation]:
-    """Return where a compiled body violates the contract; none, if it is a character.
+    """Return the violations of a compiled body; empty if it is a character.
 
     Args:
         model: The body alone.
         feet: Bodies that may touch the ground.
-        key_bodies: Bodies whose positions say most about a pose.
-        carrier: Body that could carry a box, if any.
+        key_bodies: Bodies whose positions best describe a pose.
+        carrier: Body that can carry a box, or None.
     """
     named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
     return [
@@ -60,11 +60,11 @@ def violations(
 
 
 def lowest_bodies(model: mujoco.MjModel, *, within: float = 0.03) -> tuple[float, list[str]]:
-    """Return the height of the lowest point in the rest pose, in metres, and the bodies that come near it.
+    """Return the height of the lowest point in the rest pose, in metres, and the bodies close to it.
 
     Args:
         model: The body.
-        within: How near, in metres.
+        within: Largest height above the lowest point, in metres.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -155,7 +155,7 @@ def _actuators(model: mujoco.MjModel) -> Iterator[Violation]:
 
 
 def _controls(model: mujoco.MjModel, body: int) -> list[str]:
-    """Names of the actuators that a body should have."""
+    """Names of the required actuators of a body."""
     name, kinds = model.body(body).name, kinds_of(model, body)
     if not kinds:
         return []
@@ -202,7 +202,7 @@ def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Height of the lowest point of a shape: of spheres, capsules and boxes, of others that of their bounding box."""
+    """Height of the lowest point of a sphere, capsule or box, or of the bounding box of any other shape."""
     height, vertical, size = data.geom_xpos[geom, 2], abs(data.geom_xmat[geom, 6:]), model.geom_size[geom]
     match int(model.geom_type[geom]):
         case mujoco.mjtGeom.mjGEOM_SPHERE:

@@ -1,4 +1,4 @@
-"""Motion clips: what a character's joints do over time."""
+"""Motion clips: trajectories of a character's root and joints."""
 
 import lzma
 import math
@@ -22,9 +22,9 @@ from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
 
 LARGEST = 2**28
-"""Bytes of the arrays of a clip: hours of a T-Rex at 60 frames per second."""
+"""Most bytes of the arrays of a clip: hours of a T-Rex at 60 frames per second."""
 
-# What zipfile, NumPy and torch raise when a file is damaged or of another kind.
+# Exceptions of zipfile, NumPy and torch when a file is damaged or of another kind.
 UNREADABLE = (
     *(ArithmeticError, AttributeError, BadZipFile, EOFError, LookupError, MemoryError, OSError, RuntimeError),
     *(SyntaxError, TokenError, TypeError, ValueError, lzma.LZMAError, struct.error, zlib.error),
@@ -35,19 +35,19 @@ UNREADABLE = (
 class MotionClip:
     """A trajectory of a character's root and joints at a constant frame rate.
 
-    The quaternions are kept normalised, with signs that make them continuous. A looping clip ends in the pose it begins
-    with; each further cycle begins at the place on the ground and with the heading in which the last one ended, while
-    height, roll and pitch start anew.
+    The quaternions are normalised, with signs that make them continuous. A looping clip ends in the pose of its
+    beginning. Each further cycle continues from the horizontal position and heading at the end of the last one, with
+    height, roll and pitch from the first frame.
 
     Args:
         character: Name of the character.
         qpos: States in MuJoCo's order for the character's model, shape ``(T, nq)``, float64, T >= 2: root position and
-            quaternion ``(w, x, y, z)``, then the joints in the order of the bodies. Not to be written to.
+            quaternion ``(w, x, y, z)``, then the joints in the order of the bodies. Read-only.
         fps: Frames per second.
         loop: Whether the motion repeats.
 
     Raises:
-        ValueError: If the states are not of that shape, not finite or not rotations, or ``fps`` is no positive number.
+        ValueError: If the states have another shape, are not finite or not rotations, or ``fps`` is not positive.
 
     Example:
         >>> import torch
@@ -80,25 +80,25 @@ class MotionClip:
 
     @property
     def layout(self) -> JointLayout:
-        """Which numbers of a state belong to which joint."""
+        """Indices of the joints in a state."""
         return joint_layout(self.character)
 
     @property
     def duration(self) -> float:
-        """Seconds from the first frame to the last, of one cycle if it loops."""
+        """Seconds from the first frame to the last; one cycle of a loop."""
         return (len(self.qpos) - 1) / self.fps
 
     @cached_property
     def cycle(self) -> Placement:
-        """What one cycle of a loop does to the root's place on the ground."""
+        """Change of the root's horizontal position and heading over one cycle."""
         return placing(self.qpos[0], self.qpos[-1])
 
     @cached_property
     def qvel(self) -> Tensor:
         """Velocities in MuJoCo's convention at every frame, shape ``(T, nv)``: means of the differences on both sides.
 
-        Linear velocity of the root in the world; angular velocities of the root and of ball joints in the frames of
-        their own bodies.
+        The root's linear velocity is in the world; angular velocities of the root and of ball joints are in the frames
+        of their bodies.
         """
         steps = differences(self.qpos, self.layout) * self.fps
         before, after = steps[:1], steps[-1:]
@@ -119,7 +119,7 @@ class MotionClip:
         return self.cycle.power(cycles).qpos(qpos) if self.loop else qpos
 
     def velocity(self, times: Tensor) -> Tensor:
-        """Velocity at any time, shape ``(*B, nv)``, linear between those of the frames; see :attr:`qvel`."""
+        """Velocity at any time, shape ``(*B, nv)``, interpolated linearly between frames; see :attr:`qvel`."""
         frame, fraction, cycles = self._locate(times)
         qvel = torch.lerp(self.qvel[frame], self.qvel[frame + 1], fraction.unsqueeze(-1))
         return self.cycle.power(cycles).qvel(qvel) if self.loop else qvel
@@ -129,7 +129,7 @@ class MotionClip:
         return replace(self, qpos=self.qpos[:, self.layout.mirror] * self.layout.mirror_sign)
 
     def resampled(self, fps: float) -> Self:
-        """Return the clip at another frame rate, or the nearest one that divides its duration into whole frames."""
+        """Return the clip at the frame rate nearest to ``fps`` that divides its duration into whole frames."""
         frames = max(1, round(self.duration * fps))
         times = torch.linspace(0, self.duration, frames + 1, dtype=torch.float64)
         return replace(self, qpos=self._within(times), fps=frames / self.duration)
@@ -149,11 +149,11 @@ class MotionClip:
         return replace(self, qpos=self._within(times), loop=False)
 
     def placed(self, placement: Placement) -> Self:
-        """Carry the clip to another place and direction on the ground."""
+        """Return the clip at another horizontal position and heading."""
         return replace(self, qpos=placement.qpos(self.qpos))
 
     def save(self, path: str | Path) -> None:
-        """Write a NumPy archive (``.npz``) of plain arrays: numbers keep every bit, and reading runs no code."""
+        """Write a NumPy archive (``.npz``) of plain arrays, bit for bit; reading it runs no code."""
         joints = np.array(self.layout.names)
         np.savez_compressed(
             path, character=self.character, joints=joints, qpos=self.qpos.numpy(), fps=self.fps, loop=self.loop
@@ -161,10 +161,10 @@ class MotionClip:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote.
+        """Read a file of :meth:`save`.
 
         Raises:
-            MotionFormatError: If the file is no clip, is damaged, or its joints are not those of the character's model.
+            MotionFormatError: If the file is no clip, is damaged, or has other joints than the character's model.
         """
         try:
             return cls._from_arrays(_arrays(Path(path)))
@@ -192,12 +192,12 @@ class MotionClip:
         return frame, position - frame, cycles
 
     def _within(self, times: Tensor) -> Tensor:
-        """State at times within the first cycle, the end included."""
+        """State at times within the first cycle, including its end."""
         return replace(self, loop=False).at(times)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a NumPy archive, none of which would fill the memory."""
+    """Return the arrays of a NumPy archive, after checking its size."""
     with ZipFile(path) as archive:
         if (size := sum(member.file_size for member in archive.infolist())) > LARGEST:
             raise ValueError(f"it would unpack to {size} bytes, more than the {LARGEST} of hours of motion")
@@ -206,12 +206,12 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def concatenated(clips: Sequence[MotionClip]) -> MotionClip:
-    """Play clips one after another, each beginning at the place and in the direction in which the last one ended.
+    """Play clips one after another, each from the horizontal position and heading at the end of the last one.
 
-    The first frame of a clip is taken for the last of the one before: their poses should agree.
+    The first frame of a clip is identified with the last frame of the previous one: their poses should agree.
 
     Args:
-        clips: One or more, of one character and frame rate.
+        clips: One or more clips, of one character and frame rate.
 
     Raises:
         ValueError: If there are none, or they differ in character or frame rate.
@@ -233,7 +233,7 @@ def differences(qpos: Tensor, layout: JointLayout) -> Tensor:
 
     Args:
         qpos: States, shape ``(T, nq)``.
-        layout: Of the character.
+        layout: Layout of the character.
     """
     before, after = qpos[:-1], qpos[1:]
     change = qpos.new_empty(len(qpos) - 1, layout.nv)
@@ -245,7 +245,7 @@ def differences(qpos: Tensor, layout: JointLayout) -> Tensor:
 
 
 def _canonical(quaternions: Tensor) -> Tensor:
-    """Normalise and make continuous, shape ``(T, Q, 4)``; what is so already keeps every bit."""
+    """Normalise and make continuous, shape ``(T, Q, 4)``; valid quaternions keep every bit."""
     norm = torch.linalg.vector_norm(quaternions, dim=-1, keepdim=True)
     if (norm < 0.5).any():
         frame = int((norm < 0.5).flatten(1).any(-1).nonzero()[0])

@@ -13,12 +13,12 @@ from torchrl_mcp.envs.rotations import rotate
 
 
 class ContactPoints(NamedTuple):
-    """Points of a body over time: the corners of its boxes, the undersides of its spheres and of the ends of capsules.
+    """Points of a body over time: corners of boxes, and undersides of spheres and of the ends of capsules.
 
     Args:
-        positions: In the world, shape ``(T, P, 3)``, in metres.
-        velocities: Of the material there, shape ``(T, P, 3)``, in m/s.
-        offsets: Within the body, apart from the radius of what is round, shape ``(P, 3)``.
+        positions: Positions in the world, shape ``(T, P, 3)``, in metres.
+        velocities: Velocities of the body at these points, shape ``(T, P, 3)``, in m/s.
+        offsets: Positions in the body's frame, at the centres of round shapes, shape ``(P, 3)``.
     """
 
     positions: Tensor
@@ -27,12 +27,12 @@ class ContactPoints(NamedTuple):
 
 
 def contact_points(character: str, body: str, states: BodyStates) -> ContactPoints:
-    """Follow the points of one body.
+    """Return the contact points of one body.
 
     Args:
         character: Name of the character.
-        body: Name of a body of it.
-        states: Of all its bodies, from :func:`~torchrl_mcp.envs.motions.kinematics.body_states`, T frames.
+        body: Name of the body.
+        states: States of all bodies, from :func:`~torchrl_mcp.envs.motions.kinematics.body_states`, T frames.
     """
     offsets, radii = _outline(character_model(character), body)
     index = body_names(character).index(body)
@@ -48,7 +48,7 @@ def contact_points(character: str, body: str, states: BodyStates) -> ContactPoin
 
 
 def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
-    """Points ``(P, 3)`` in the frame of a body and the radius ``(P,)`` of what is round about them."""
+    """Points ``(P, 3)`` in the frame of a body, and the radii ``(P,)`` of round shapes about them."""
     points, radii = [], []
     owner = model.body(body)
     for index in range(owner.geomadr[0], owner.geomadr[0] + owner.geomnum[0]):

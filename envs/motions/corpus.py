@@ -1,4 +1,4 @@
-"""Libraries of reference motions: those that come with the project, and a folder of clips."""
+"""Libraries of reference motions: the generated ones, and folders of clips."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ TREX_CLIPS = ("straight", "left_gentle", "left_sharp", "right_gentle", "right_sh
 
 
 def generated_library(character: str, seed: int) -> MotionLibrary:
-    """Return the generated corpus of a character: walking and turning, 230 s of two-legged ones and 11 s of a T-Rex.
+    """Return the generated corpus of a character: walking and turning, 230 s for biped and humanoid, 11 s for T-Rex.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
-        seed: Of the paths that two-legged characters walk.
+        seed: Seed of the paths of biped and humanoid.
 
     Raises:
-        ValueError: If no motions of the character can be generated.
+        ValueError: If there is no generator for the character.
     """
     if character == "trex":
         return MotionLibrary(dict(zip(TREX_CLIPS, trex_corpus(), strict=True)), dtype=torch.float32)
@@ -28,14 +28,14 @@ def generated_library(character: str, seed: int) -> MotionLibrary:
 
 
 def folder_library(character: str, path: str | Path) -> MotionLibrary:
-    """Return the clips in a folder, as ``torchrl-mcp-motions import`` writes them, by their names without suffix.
+    """Return the clips in a folder of ``torchrl-mcp-motions import``, by file name without suffix.
 
     Args:
-        character: Of whom they must be.
+        character: Character of the clips.
         path: Folder with ``.npz`` files.
 
     Raises:
-        ValueError: If there are none, one is damaged, or one is of another character.
+        ValueError: If there are no clips, one is damaged, or one is of another character.
     """
     files = sorted(Path(path).glob("*.npz"))
     if not files:

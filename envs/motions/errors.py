@@ -1,15 +1,15 @@
-"""What is wrong with a motion file."""
+"""Errors in motion files."""
 
 from pathlib import Path
 
 
 class MotionFormatError(ValueError):
-    """A motion file that cannot be used, with the place where it goes wrong.
+    """An error in a motion file, with its position.
 
     Args:
         path: The file.
-        message: What is wrong and what to do about it.
-        line: Number of the line, from 1, where there is one to name.
+        message: Description of the error, and the remedy.
+        line: Number of the line, from 1, if known.
 
     Example:
         >>> print(MotionFormatError("walk.bvh", "'one' is no number: correct it", line=12))

@@ -1,4 +1,4 @@
-"""Where a character's joints are in MuJoCo's ``qpos`` and ``qvel``."""
+"""Indices of a character's joints in MuJoCo's ``qpos`` and ``qvel``."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,7 +13,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 
 @cache
 def character_model(character: str) -> mujoco.MjModel:
-    """Compile a character alone, without floor; shared, so not to be changed.
+    """Compile a character alone, without floor; the result is shared and must not be changed.
 
     Raises:
         ValueError: If there is no such character.
@@ -25,7 +25,7 @@ def character_model(character: str) -> mujoco.MjModel:
 
 @dataclass(frozen=True, eq=False)
 class JointLayout:
-    """A character's joints by name, and which numbers of a state are theirs.
+    """A character's joints by name, and their indices in a state.
 
     Args:
         names: Joints in the order of the bodies, the free joint of the root first.
@@ -35,8 +35,8 @@ class JointLayout:
         spins: Indices in ``qvel`` of their angular velocities, shape ``(Q, 3)``, int64.
         angles: Indices in ``qpos`` of the hinges, shape ``(H,)``, int64.
         rates: Indices in ``qvel`` of their velocities, shape ``(H,)``, int64.
-        mirror: Index in ``qpos`` of what takes each number's place in the mirror image, shape ``(nq,)``, int64.
-        mirror_sign: Its sign there, shape ``(nq,)``, float64.
+        mirror: Index in ``qpos`` of the number that replaces each number in the mirror image, shape ``(nq,)``, int64.
+        mirror_sign: Sign of each number in the mirror image, shape ``(nq,)``, float64.
     """
 
     names: tuple[str, ...]
@@ -80,7 +80,7 @@ def joint_layout(character: str) -> JointLayout:
 
 
 def twin(name: str) -> str:
-    """Name of the same part on the other side of the body; a part in the middle is its own twin."""
+    """Name of the same part on the other side of the body; a central part is its own twin."""
     for side, other in (("left_", "right_"), ("right_", "left_")):
         if name.startswith(side):
             return other + name.removeprefix(side)
@@ -88,7 +88,7 @@ def twin(name: str) -> str:
 
 
 def _mirror(model: mujoco.MjModel, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
-    """Reflect y: a position changes y; a rotation, being a pseudo-vector, x and z; left and right change places."""
+    """Reflect y: a position changes y; a rotation, a pseudo-vector, changes x and z; left and right are exchanged."""
     source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
     for joint, name in enumerate(names):
         here, there = model.jnt_qposadr[joint], model.joint(twin(name)).qposadr[0]

@@ -1,4 +1,4 @@
-"""Where a character's bodies are, by MuJoCo's forward kinematics."""
+"""Positions and velocities of a character's bodies, by MuJoCo's forward kinematics."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ class BodyStates(NamedTuple):
     """The L bodies of a character, the root first, in world coordinates.
 
     Args:
-        positions: Of the bodies' origins, shape ``(*B, L, 3)``, in metres.
+        positions: Positions of the bodies' origins, shape ``(*B, L, 3)``, in metres.
         orientations: Unit quaternions (w, x, y, z), shape ``(*B, L, 4)``.
-        linear_velocities: Of the bodies' origins, shape ``(*B, L, 3)``, in m/s.
-        angular_velocities: Shape ``(*B, L, 3)``, in rad/s.
+        linear_velocities: Velocities of the bodies' origins, shape ``(*B, L, 3)``, in m/s.
+        angular_velocities: Angular velocities, shape ``(*B, L, 3)``, in rad/s.
     """
 
     positions: Tensor
@@ -37,8 +37,8 @@ def body_states(character: str, qpos: Tensor, qvel: Tensor) -> BodyStates:
 
     Args:
         character: Name of the character.
-        qpos: Shape ``(T, nq)``.
-        qvel: Shape ``(T, nv)``.
+        qpos: Positions in MuJoCo's convention, shape ``(T, nq)``.
+        qvel: Velocities in MuJoCo's convention, shape ``(T, nv)``.
     """
     model = character_model(character)
     data = mujoco.MjData(model)
@@ -52,6 +52,6 @@ def body_states(character: str, qpos: Tensor, qvel: Tensor) -> BodyStates:
         positions[frame], orientations[frame] = data.xpos, data.xquat
         twists[frame], centres[frame] = data.cvel, data.subtree_com[1]
     angular = twists[..., :3]
-    # MuJoCo gives the velocity of the point of the body that is at the character's centre of mass.
+    # MuJoCo's cvel is the velocity of the body at the point of the character's centre of mass.
     linear = twists[..., 3:] + np.cross(angular, positions - centres)
     return BodyStates(*(torch.from_numpy(field[:, 1:]) for field in (positions, orientations, linear, angular)))

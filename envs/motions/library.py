@@ -1,4 +1,4 @@
-"""Many motion clips, looked up in one batch."""
+"""Many motion clips, read in one batch."""
 
 import copy
 import hashlib
@@ -17,11 +17,11 @@ from torchrl_mcp.envs.rotations import continuous
 
 
 class MotionState(NamedTuple):
-    """Moments of reference motions, where their clips have them.
+    """Moments of reference motions, at the positions and headings of their clips.
 
     Args:
         qpos: States of the character, shape ``(N, nq)``.
-        qvel: Their velocities in MuJoCo's convention, shape ``(N, nv)``.
+        qvel: Velocities in MuJoCo's convention, shape ``(N, nv)``.
         bodies: The bodies in world coordinates, each ``(N, L, ...)``.
     """
 
@@ -31,11 +31,11 @@ class MotionState(NamedTuple):
 
 
 class PlacedMotion:
-    """Moments of reference motions carried to other places and directions, worked out as far as they are asked for.
+    """Moments of reference motions at other positions and headings, computed lazily.
 
     Args:
         moment: N moments.
-        placement: N turns and shifts, or None to leave them where they are.
+        placement: N turns and shifts, or None for no change.
     """
 
     def __init__(self, moment: MotionState, placement: Placement | None) -> None:
@@ -50,31 +50,31 @@ class PlacedMotion:
 
     @cached_property
     def qvel(self) -> Tensor:
-        """Their velocities in MuJoCo's convention, shape ``(N, nv)``."""
+        """Velocities in MuJoCo's convention, shape ``(N, nv)``."""
         return self.moment.qvel if self.placement is None else self.placement.qvel(self.moment.qvel)
 
     @cached_property
     def positions(self) -> Tensor:
-        """Of the bodies, shape ``(N, L, 3)``."""
+        """Positions of the bodies, shape ``(N, L, 3)``."""
         positions = self.moment.bodies.positions
         return positions if self.placement is None else self._each.points(positions)
 
     @cached_property
     def orientations(self) -> Tensor:
-        """Of the bodies, unit quaternions, shape ``(N, L, 4)``."""
+        """Orientations of the bodies as unit quaternions, shape ``(N, L, 4)``."""
         orientations = self.moment.bodies.orientations
         return orientations if self.placement is None else self._each.quaternions(orientations)
 
     @cached_property
     def bodies(self) -> BodyStates:
-        """All of the bodies, in the world."""
+        """States of the bodies in the world."""
         velocities = (self.moment.bodies.linear_velocities, self.moment.bodies.angular_velocities)
         if self.placement is not None:
             velocities = (self._each.vectors(velocities[0]), self._each.vectors(velocities[1]))
         return BodyStates(self.positions, self.orientations, *velocities)
 
     def carried(self, placement: Placement) -> "PlacedMotion":
-        """Return these moments carried further, by N turns and shifts."""
+        """Return these moments moved further by N turns and shifts."""
         return PlacedMotion(self.moment, placement if self.placement is None else placement.after(self.placement))
 
     def __getitem__(self, index: slice) -> "PlacedMotion":
@@ -82,7 +82,7 @@ class PlacedMotion:
         return self._of([part[index] for part in self._parts()])
 
     def replaced(self, ids: Tensor, others: "PlacedMotion") -> "PlacedMotion":
-        """Return these moments with ``others`` in the rows ``ids``; both are carried somewhere, or neither is."""
+        """Return these moments with ``others`` in the rows ``ids``; both have a placement, or neither has."""
         pairs = zip(self._parts(), others._parts(), strict=True)
         return self._of([part.index_copy(0, ids, other) for part, other in pairs])
 
@@ -96,16 +96,16 @@ class PlacedMotion:
 
 
 class MotionLibrary:
-    """Clips of one character as one table of frames, from which moments of many clips are read at once.
+    """Clips of one character in one table of frames, from which moments of many clips are read in one batch.
 
-    Between frames every number is interpolated linearly and quaternions are normalised again: at 30 frames per second
-    or more, and at a walker's speeds, within a thousandth of a radian of :meth:`MotionClip.at`.
+    Between frames all numbers are interpolated linearly, and quaternions are normalised again. At 30 frames per second
+    or more and at walking speeds, the result is within a thousandth of a radian of :meth:`MotionClip.at`.
 
     Args:
         clips: Clips of one character, by name.
-        weights: How often each clip is drawn relative to the others, by name; None draws each moment equally often, so
-            that the weight of a clip is its duration.
-        dtype: Of all that is read.
+        weights: Relative probability of each clip, by name; None for the durations, which draws all moments equally
+            often.
+        dtype: Type of the moments.
 
     Raises:
         ValueError: If there are no clips, they are of several characters, or the weights do not fit them.
@@ -123,13 +123,13 @@ class MotionLibrary:
         self.character, self.names = characters[0], list(clips)
         self.body_names = body_names(self.character)
         self.durations = torch.tensor([clip.duration for clip in clips.values()], dtype=torch.float64)
-        """Seconds, of one cycle where a clip loops, shape ``(C,)``."""
+        """Seconds of each clip, or of one cycle if it loops, shape ``(C,)``."""
         self.loops = torch.tensor([clip.loop for clip in clips.values()])
-        """Shape ``(C,)``, bool."""
+        """Whether each clip loops, shape ``(C,)``, bool."""
         self.weights = self.durations if weights is None else self._checked(weights)
-        """Relative to their sum, the probability of each clip, shape ``(C,)``."""
+        """Relative probability of each clip, shape ``(C,)``."""
         self.digest = _digest(clips, self.weights)
-        """SHA-256 of clips and weights, by which a checkpoint knows what it was trained on."""
+        """SHA-256 of clips and weights, with which a checkpoint identifies its motions."""
         self._fps = torch.tensor([clip.fps for clip in clips.values()], dtype=torch.float64)
         lengths = torch.tensor([len(clip.qpos) for clip in clips.values()])
         self._last, self._start = lengths - 1, lengths.cumsum(0) - lengths
@@ -146,7 +146,7 @@ class MotionLibrary:
         return len(self.names)
 
     def to(self, device: torch.device | str) -> "MotionLibrary":
-        """Return the library on a device, itself if it is there."""
+        """Return the library on a device."""
         if self._table.device == torch.device(device):
             return self
         moved = copy.copy(self)
@@ -161,8 +161,8 @@ class MotionLibrary:
 
         Args:
             clips: Index of each clip, shape ``(N,)``, int64.
-            times: Seconds since its first frame, shape ``(N,)``; held at the ends unless the clip loops.
-            placement: Where to carry each clip, N turns and shifts, or None to leave them where they are.
+            times: Seconds since the clip's first frame, shape ``(N,)``; held at the ends unless the clip loops.
+            placement: Turn and shift of each clip, N of them, or None for no change.
         """
         last = self._last[clips]
         frames = times.double() * self._fps[clips]
@@ -184,12 +184,12 @@ class MotionLibrary:
         return motion if placement is None else motion.carried(placement)
 
     def sample(self, num: int, generator: torch.Generator, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Draw moments: clips by their weights, times evenly over a clip or a cycle of it.
+        """Draw moments: clips by their weights, times uniformly over a clip or one cycle.
 
         Args:
-            num: How many.
+            num: Number of moments.
             generator: Source of randomness.
-            weights: To use instead of :attr:`weights`, shape ``(C,)``.
+            weights: Weights in place of :attr:`weights`, shape ``(C,)``.
 
         Returns:
             Clips, shape ``(num,)``, int64, and times in seconds, shape ``(num,)``, float64.
@@ -209,10 +209,10 @@ class MotionLibrary:
 
 
 def _rows(clip: MotionClip) -> list[Tensor]:
-    """All that is known of every frame, each ``(T, *)``.
+    """Return the columns of the table for a clip, each ``(T, *)``.
 
-    Quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, ``qvel``. Vectors
-    and quaternions are stored component by component, which is several times as fast as body by body.
+    These are quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, and
+    ``qvel``. Vectors and quaternions are stored by component, which is several times as fast as by body.
     """
     layout, bodies = clip.layout, body_states(clip.character, clip.qpos, clip.qvel)
     turns = continuous(torch.cat([clip.qpos[:, layout.quaternions], bodies.orientations], dim=1).transpose(0, 1))

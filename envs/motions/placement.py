@@ -1,4 +1,4 @@
-"""Rigid motions of the ground plane, which carry a motion to another place and direction."""
+"""Rigid motions of the ground plane, which move a motion to another position and heading."""
 
 from typing import NamedTuple
 
@@ -35,26 +35,26 @@ class Placement(NamedTuple):
         return multiply(about_z(self.turn), quaternions)
 
     def qpos(self, qpos: Tensor) -> Tensor:
-        """Place states of a character, shape ``(*B, nq)``: its root moves, its joints stay as they are."""
+        """Move states of a character, shape ``(*B, nq)``: the root moves, the joints stay the same."""
         return torch.cat([self.points(qpos[..., :3]), self.quaternions(qpos[..., 3:7]), qpos[..., 7:]], dim=-1)
 
     def qvel(self, qvel: Tensor) -> Tensor:
-        """Place velocities of a character, shape ``(*B, nv)``: all but the root's are relative to its own bodies."""
+        """Turn velocities of a character, shape ``(*B, nv)``: only the root's linear velocity is in the world."""
         return torch.cat([self.vectors(qvel[..., :3]), qvel[..., 3:]], dim=-1)
 
     def after(self, first: "Placement") -> "Placement":
-        """Return the placement that does ``first``, then this one."""
+        """Return the composition of ``first`` and then this placement."""
         shift = torch.cat([first.shift, torch.zeros_like(first.shift[..., :1])], dim=-1)
         return Placement(self.turn + first.turn, self.points(shift)[..., :2])
 
     def inverse(self) -> "Placement":
-        """Return the placement that undoes this one."""
+        """Return the inverse placement."""
         back = Placement(-self.turn, torch.zeros_like(self.shift))
         shift = torch.cat([-self.shift, torch.zeros_like(self.shift[..., :1])], dim=-1)
         return Placement(-self.turn, back.points(shift)[..., :2])
 
     def power(self, times: Tensor) -> "Placement":
-        r"""Return the placement done k times over, k an integer of either sign, shape ``(*B)``.
+        r"""Return the placement applied k times, k an integer of either sign, shape ``(*B)``.
 
         .. math:: \sum_{j<k} R_z(j \psi) s = \frac{\sin (k \psi / 2)}{\sin (\psi / 2)} R_z(\tfrac{k - 1}{2} \psi) s
         """
@@ -67,10 +67,10 @@ class Placement(NamedTuple):
 
 
 def placing(start: Tensor, end: Tensor) -> Placement:
-    """Return the placement that carries a root's ground position and heading from one to another, angle in (-pi, pi].
+    """Return the placement from one horizontal root position and heading to another, with an angle in (-pi, pi].
 
     Args:
-        start: Root position and quaternion before, shape ``(*B, >= 7)``: states ``qpos`` will do.
+        start: Root position and quaternion before, shape ``(*B, >= 7)``, such as states ``qpos``.
         end: Root position and quaternion after, shape ``(*B, >= 7)``.
     """
     angle = heading(end[..., 3:7]) - heading(start[..., 3:7])

@@ -9,7 +9,7 @@ def single_motion(character: str, clip: str | None = None) -> MotionLibrary:
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
-        clip: Its name, or None for the first, straight ahead.
+        clip: Name of the clip, or None for the first, straight ahead.
 
     Raises:
         ValueError: If the character has no such clip.

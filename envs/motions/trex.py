@@ -18,71 +18,71 @@ FPS = 60.0
 GRAVITY = 9.81
 
 # Alexander (1976): animals of hip height h that walk at Fr = v^2 / (g h) make strides of 2.3 h Fr^0.3. For this body
-# that is 1.10 m at 1 m/s, the speed of the transfer tasks. (The slow walk in time with the natural frequency of an
-# adult's tail, of van Bijlert et al., 2021, scales to 0.7 m/s and strides of 1.7 s.)
+# that is 1.10 m at 1 m/s, the speed of the transfer tasks. (Walking slowly at the natural frequency of an adult's tail,
+# van Bijlert et al., 2021, scales to 0.7 m/s and strides of 1.7 s.)
 STRIDE_TIME = 1.1
-"""Seconds."""
+"""Seconds of a stride."""
 
 STRIDES = 2
-"""In a clip of 2.2 s. Five of them make the paper's 11 s."""
+"""Strides in a clip of 2.2 s. Five clips last as long as the paper's 11 s."""
 
 STRAIGHT = (1.0, 0.0)
 LEFT_TURNS = ((0.9, 0.5), (0.8, 1.0))
-"""Speeds in m/s and turn rates in rad/s. Whoever turns slows down."""
+"""Speeds in m/s and turn rates in rad/s; turns are slower."""
 
 HEIGHT = 0.9
-"""Of the hips, in m: 3 cm lower than at rest, so that the legs reach from step to step."""
+"""Height of the hips in metres: 3 cm lower than at rest, so that the legs reach from step to step."""
 
-# Metres about the path and the height, and between and ahead of the feet, chosen such that pushes of the ground against
-# the feet make the body move like this: its weight goes from foot to foot as it sways, falls back and catches up.
+# Metres relative to path and height, and distances between and ahead of the feet, chosen so that ground forces on the
+# feet can produce the motion: the weight shifts from foot to foot as the body sways, falls back and catches up.
 SWAY: Keyframes = ((0.06, 0.0), (0.31, -0.018), (0.56, 0.0), (0.81, 0.018))
 SURGE: Keyframes = ((0.185, 0.01), (0.435, -0.01), (0.685, 0.01), (0.935, -0.01))
 BOB: Keyframes = ((0.055, -0.012), (0.305, 0.012), (0.555, -0.012), (0.805, 0.012))
 STEP_WIDTH = 0.12
 TOE_AHEAD = 0.19
-"""Of the hips, in m: where the tip of a foot is in the middle of its stance."""
+"""Distance in metres of a foot's tip ahead of the hips in the middle of its stance."""
 
-# In rad. The right hip is ahead when the right foot touches down, and the pelvis drops on the side of the swing.
+# In radians. The right hip is ahead when the right foot touches down, and the pelvis drops on the swinging side.
 PELVIS_YAW: Keyframes = ((0.0, 0.06), (0.25, 0.0), (0.5, -0.06), (0.75, 0.0))
 PELVIS_ROLL: Keyframes = ((0.2, -0.03), (0.45, 0.0), (0.7, 0.03), (0.95, 0.0))
 LEAN = 0.53
-"""Of the pelvis in a turn, relative to the lean that balances it: that of walking humans."""
+"""Lean of the pelvis in a turn, relative to the balancing lean, as in walking humans."""
 
 TAIL_YAW: Keyframes = ((0.0, -1.0), (0.25, 0.0), (0.5, 1.0), (0.75, 0.0))
 TAIL_SWING = (0.09, 0.04, 0.04, 0.04, 0.04)
-"""Amplitude of each joint in rad. The first outweighs the yaw of the pelvis, so that the tail swings against it."""
+"""Amplitude of each joint in radians. The first exceeds the pelvis's yaw, so that the tail swings against it."""
 
 TAIL_LAG = 0.04
-"""Strides by which each joint of the tail is behind the last."""
+"""Delay of each joint of the tail after the previous one, in strides."""
 
 TAIL_BEND, CHEST_BEND, NECK_BEND = 0.12, 0.1, 0.075
-"""Into a turn, in rad per rad/s, at each joint."""
+"""Bend into a turn at each joint, in radians per rad/s."""
 
 DUTY = 0.62
-"""Fraction of a stride in which a foot is on the ground."""
+"""Fraction of a stride for which a foot is on the ground."""
 
 SWING = (DUTY + 0.02, 0.98)
-"""Phases between which a foot moves forward: once it has left the ground, and until just before it is back."""
+"""Phases between which a foot moves forward: from leaving the ground to just before touching down."""
 
 FOOT_LIFT: Keyframes = ((0.0, 0.0), (DUTY, 0.0), (0.78, 0.1))
 FOOT_ASIDE: Keyframes = ((0.0, 0.0), (DUTY, 0.0), (0.78, 0.05))
-"""Metres up, and outwards, around the other leg."""
+"""Metres upwards, and metres outwards around the other leg."""
 
 FOOT_PITCH: Keyframes = ((0.0, 0.0), (0.44, 0.0), (0.7, -0.9), (0.98, 0.0))
-"""Of the toes upwards, in rad: the foot rolls over its tip before it leaves the ground."""
+"""Pitch of the toes upwards in radians: the foot rolls over its tip before it leaves the ground."""
 
 METATARSUS: Keyframes = ((0.0, 0.3), (0.3, 0.15), (0.58, -0.2), (0.8, 0.75))
-"""Angle by which it leans back from the line between hip and toes, in rad."""
+"""Angle in radians by which the metatarsus leans back from the line between hip and toes."""
 
 
 class Step(NamedTuple):
     """The motion of a foot.
 
     Attributes:
-        position: Of its joint, the root of the toes, shape ``(T, 3)``.
-        orientation: Shape ``(T, 4)``.
-        yaw: Direction in which it points, shape ``(T,)``.
-        phase: Of its own stride, which begins when it touches down, shape ``(T,)``.
+        position: Position of the foot's joint, the root of the toes, shape ``(T, 3)``.
+        orientation: Orientation of the foot, shape ``(T, 4)``.
+        yaw: Heading of the foot, shape ``(T,)``.
+        phase: Phase of the foot's stride, which begins when it touches down, shape ``(T,)``.
     """
 
     position: Tensor
@@ -92,7 +92,7 @@ class Step(NamedTuple):
 
 
 def trex_corpus() -> list[MotionClip]:
-    """Walking straight, turning left at two rates, and turning right as the mirror images of that: 11 s of loops.
+    """Generate 11 s of loops: walking straight, two turns to the left, and their mirror images.
 
     Example:
         >>> [round(float(clip.cycle.turn), 1) for clip in trex_corpus()]
@@ -103,14 +103,14 @@ def trex_corpus() -> list[MotionClip]:
 
 
 def trex_walk(speed: float, turn_rate: float) -> MotionClip:
-    """Walk along an arc of a circle, or straight, in a loop that begins at the origin.
+    """Walk straight or along a circular arc, in a loop that begins at the origin.
 
     Args:
-        speed: Of the hips, in m/s.
-        turn_rate: To the left, in rad/s.
+        speed: Speed of the hips in m/s.
+        turn_rate: Turn rate to the left in rad/s.
 
     Raises:
-        ValueError: If it would walk backwards, the legs do not reach from step to step, or the loop turns half around.
+        ValueError: If the speed is negative, the steps are too long for the legs, or the loop turns by half a circle.
 
     Reference:
         Alexander, Estimates of speeds of dinosaurs, 1976, https://doi.org/10.1038/261129a0.
@@ -141,7 +141,7 @@ def trex_walk(speed: float, turn_rate: float) -> MotionClip:
 
 
 def _path(time: Tensor, speed: float, turn_rate: float) -> Placement:
-    """Arc from the origin along x: its chord is v t sinc(w t / 2) long, in the direction w t / 2."""
+    """Arc from the origin along x: its chord has length v t sinc(w t / 2) and direction w t / 2."""
     turn = turn_rate * time
     chord = speed * time * torch.sinc(turn / 2 / torch.pi)
     return Placement(turn, chord.unsqueeze(-1) * torch.stack([(turn / 2).cos(), (turn / 2).sin()], dim=-1))
@@ -154,7 +154,7 @@ def _pelvis(phase: Tensor, lean: float) -> tuple[Tensor, Tensor]:
 
 
 def _front(phase: Tensor, place: Tensor, pelvis: Tensor, turn_rate: float) -> dict[str, Tensor]:
-    """Chest, neck and head: the chest is a beam that turns such that the head at its end keeps its height and line."""
+    """Chest, neck and head: the chest turns like a beam so that the head at its end keeps its height and line."""
     beam_turn, neck = (about_z(torch.full_like(phase, bend * turn_rate)) for bend in (CHEST_BEND, NECK_BEND))
     offset = {name: _offset(name).expand(len(phase), 3) for name in ("chest", "lower_neck", "upper_neck", "head")}
     neck_to_head = offset["upper_neck"] + rotate(neck, offset["head"])
@@ -163,7 +163,7 @@ def _front(phase: Tensor, place: Tensor, pelvis: Tensor, turn_rate: float) -> di
     _, y, z = (rest + offset["chest"] + beam - place - rotate(pelvis, offset["chest"])).unbind(-1)
     length = torch.linalg.vector_norm(beam, dim=-1)
     wanted = torch.stack([(length**2 - y**2 - z**2).sqrt(), y, z], dim=-1)
-    # The cross product is the rotation vector but for terms of third order in its small angle.
+    # The cross product equals the rotation vector up to third order in its small angle.
     steadying = from_rotation_vector(torch.linalg.cross(beam, wanted) / length.unsqueeze(-1) ** 2)
     chest = multiply(steadying, beam_turn)
     bent = about_z(torch.full_like(phase, (CHEST_BEND + 2 * NECK_BEND) * turn_rate))
@@ -172,15 +172,15 @@ def _front(phase: Tensor, place: Tensor, pelvis: Tensor, turn_rate: float) -> di
 
 
 def _tail(phase: Tensor, turn_rate: float) -> dict[str, Tensor]:
-    """A wave that runs down the tail."""
+    """Joints of the tail: a wave that runs down the tail."""
     yaws = [swing * smooth(TAIL_YAW, phase - TAIL_LAG * joint) for joint, swing in enumerate(TAIL_SWING)]
     return {f"tail_{joint}": about_z(yaw - TAIL_BEND * turn_rate) for joint, yaw in enumerate(yaws, start=1)}
 
 
 def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
-    """Plant a foot beside the path for its stance, let it roll over its tip, and carry it to its next place.
+    """Motion of a foot, which stands beside the path in stance, rolls over its tip, and swings to its next foothold.
 
-    The tip is a sphere, which rolls on without sliding: it advances by its radius times the angle.
+    The tip is a sphere that rolls without sliding: it advances by its radius times the angle.
     """
     start = 0.0 if side == "right" else 0.5
     own = phase - start
@@ -196,9 +196,9 @@ def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
 
 
 def _plant(side: str, touchdown: Tensor, speed: float, turn_rate: float) -> Placement:
-    """Ground under the tip of a foot that touches down at a phase, and the direction of the foot.
+    """Position and heading on the ground of the tip of a foot that touches down at a phase.
 
-    In a turn the feet are set outside the path of the hips, so that the body balances leaning inwards.
+    In a turn the feet are outside the path of the hips, so that the body balances while leaning inwards.
     """
     path = _path((touchdown + DUTY / 2) * STRIDE_TIME, speed, turn_rate)
     aside = (STEP_WIDTH / 2 if side == "left" else -STEP_WIDTH / 2) - HEIGHT * speed * turn_rate / GRAVITY
@@ -207,19 +207,19 @@ def _plant(side: str, touchdown: Tensor, speed: float, turn_rate: float) -> Plac
 
 
 def _leg(side: str, position: Tensor, orientation: Tensor, heading: Tensor, step: Step) -> dict[str, Tensor]:
-    r"""Inverse kinematics from pelvis to foot, in the plane through hip and toes that turns half-way with the foot.
+    r"""Inverse kinematics from pelvis to foot, in the plane through hip and toes that turns half as far as the foot.
 
-    Angles in that plane are from straight down, forwards. The metatarsus follows its keyframes. Thigh :math:`a` and
-    shank :math:`b` then make a triangle with the line :math:`r` from hip to ankle, knee in front:
+    Angles in that plane are forward from straight down. The metatarsus follows its keyframes. Thigh :math:`a` and shank
+    :math:`b` then form a triangle with the line :math:`r` from hip to ankle, with the knee in front:
 
     .. math:: \cos(\alpha_{hip} - \alpha_r) = \frac{a^2 + r^2 - b^2}{2 a r}
 
     Args:
         side: ``"right"`` or ``"left"``.
-        position: Of the pelvis, shape ``(T, 3)``.
-        orientation: Of the pelvis, shape ``(T, 4)``.
-        heading: Direction of the path, shape ``(T,)``.
-        step: Of the foot.
+        position: Position of the pelvis, shape ``(T, 3)``.
+        orientation: Orientation of the pelvis, shape ``(T, 4)``.
+        heading: Heading of the path, shape ``(T,)``.
+        step: Motion of the foot.
     """
     hip = position + rotate(orientation, _offset(f"{side}_hip").expand_as(position))
     yaw = (heading + step.yaw) / 2
@@ -244,7 +244,7 @@ def _leg(side: str, position: Tensor, orientation: Tensor, heading: Tensor, step
 
 
 def _offset(body: str) -> Tensor:
-    """Where a body hangs on its parent, shape ``(3,)``."""
+    """Position of a body in its parent's frame, shape ``(3,)``."""
     return torch.tensor(character_model("trex").body(body).pos)
 
 

@@ -20,7 +20,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
 
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import experiment, policies
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.trainer import Trainer
@@ -67,7 +67,7 @@ def rehearse(method, waits):
             checkpoint.find(run).unlink()
             experiment.resume(run)
             found["resumed"] = rows(run)
-        found["evaluation"] = experiment.evaluate_run(run, episodes=2, seed=0, max_episode_steps=3)
+        found["evaluation"] = policies.evaluate_run(run, episodes=2, seed=0, max_episode_steps=3)
     return found
 
 

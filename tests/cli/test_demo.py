@@ -15,7 +15,7 @@ from matplotlib.image import imread
 
 from torchrl_mcp.cli import demo as command
 from torchrl_mcp.cli import demonstration as demo
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 
 FILES = [
     "results.md",
@@ -97,7 +97,7 @@ def test_the_last_words_are_the_table_and_where_to_find_it(finished):
 @pytest.mark.parametrize("name", ["before", "after", "scratch_early", "scratch"])
 def test_the_table_holds_the_numbers_of_an_evaluation_on_the_held_out_directions(finished, name):
     policy = demo.policies(finished.folder, configurations(finished.folder, *SMOKE))[name]
-    expected = experiment.evaluate_run(policy.path, episodes=8, seed=12345, directions=[1.5 * math.pi, 2 * math.pi])
+    expected = policies.evaluate_run(policy.path, episodes=8, seed=12345, directions=[1.5 * math.pi, 2 * math.pi])
     found = json.loads((finished.folder / "results.json").read_text())[name]
     assert {mode: found[mode] for mode in expected} == expected
     rows = [line for line in (finished.folder / "results.md").read_text().splitlines() if policy.label in line]

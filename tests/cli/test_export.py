@@ -8,8 +8,8 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.cli import export
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.experiment import restore
 from torchrl_mcp.runs.export import DeterministicPolicy
+from torchrl_mcp.runs.policies import restore
 
 
 def call(monkeypatch, *words):

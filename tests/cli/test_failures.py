@@ -21,7 +21,7 @@ def said(cfg, monkeypatch, failure):
 
     monkeypatch.setattr(experiment, "train", fail)
     with pytest.raises(SystemExit) as stop:
-        training.run(cfg)
+        training.train(cfg)
     assert stop.value.code not in (0, 1)
     return str(stop.value.code)
 

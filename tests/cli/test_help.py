@@ -49,6 +49,7 @@ def test_each_command_says_its_version(command):
     [
         ("torchrl-mcp-play", ["nowhere"], "there is no nowhere: give a run folder"),
         ("torchrl-mcp-play", ["builtin:horse"], "no builtin:horse comes with the library: give one of builtin:biped"),
+        ("torchrl-mcp-play", ["builtin:biped", "--output", "film.avi"], "film.avi is not the name of a film"),
         ("torchrl-mcp-evaluate", ["nowhere"], "there is no nowhere: give a run folder"),
         ("torchrl-mcp-figures", ["primitives", "nowhere"], "there is no nowhere: give a run folder"),
         ("torchrl-mcp-motions", ["inspect", "nowhere.bvh"], "there is no nowhere.bvh"),

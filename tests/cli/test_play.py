@@ -70,6 +70,14 @@ def test_without_opengl_the_packages_to_install_are_named(monkeypatch, tmp_path)
     assert "libosmesa6" in said
 
 
+def test_without_what_writes_mp4_a_film_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr(playing, "play", lambda arguments: pytest.fail("the policy is restored"))
+    said = refused(monkeypatch, "builtin:biped", "--output", tmp_path / "films" / "film.mp4")
+    assert "pip install 'torchrl-mcp[video]'" in said
+    assert not (tmp_path / "films").exists()
+
+
 def test_without_studio_the_web_viewer_says_which_mujoco_has_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "torchrl_mcp.viewer.web", None)
     assert "install that" in refused(monkeypatch, "builtin:biped", "--viewer", "web")

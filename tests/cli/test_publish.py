@@ -1,5 +1,6 @@
 """Gates for tasks over the library's primitives: small files, exact, with a card that says where they come from."""
 
+import csv
 import shutil
 import sys
 from pathlib import Path
@@ -11,7 +12,8 @@ from hydra import compose, initialize_config_module
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.cli import evaluate, play, publish, publishing
-from torchrl_mcp.runs import builtin, experiment
+from torchrl_mcp.runs import builtin, experiment, policies
+from torchrl_mcp.runs.publish import publish as write_published
 from torchrl_mcp.training import checkpoint
 
 PRETRAINED = builtin.builtin("mcp", "biped")
@@ -34,6 +36,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("secret") / "run"
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
     settings += ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
+    settings += ["width=1", "gating.network.width=0.1", "critic.width=0.1"]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return experiment.train(compose("train", [*settings, "task.evaluation.max_episode_steps=30"]))
 
@@ -60,7 +63,7 @@ def library(networks, monkeypatch):
 
 def act(path):
     """Deterministic actions of a policy in states of its task."""
-    _, agent, env = experiment.restore(path, num_envs=3, seed=4)
+    _, agent, env = policies.restore(path, num_envs=3, seed=4)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         return agent.actor.policy(env.reset())["action"]
 
@@ -70,8 +73,8 @@ def test_a_gate_acts_as_its_run_does_without_holding_the_primitives(run, library
     torch.testing.assert_close(act(gate), act(run), atol=0.02, rtol=0)
     with ZipFile(gate) as archive:
         assert not [name for name in archive.namelist() if "primitives" in name or "observation_normaliser" in name]
-    _, agent, _ = experiment.restore(gate, num_envs=1, seed=0)
-    _, original, _ = experiment.restore(PRETRAINED, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(gate, num_envs=1, seed=0)
+    _, original, _ = policies.restore(PRETRAINED, num_envs=1, seed=0)
     for name, parameter in original.parts["primitives"].state_dict().items():
         assert torch.equal(agent.parts["primitives"].state_dict()[name], parameter)
 
@@ -91,7 +94,7 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
     assert "512 steps, preset" in card
     assert "- It has hardly learnt anything." in card
     assert "0.976 ± 0.002" in card  # the paper's
-    numbers = experiment.evaluation(library / "mcp-biped-heading.torchrl", episodes=2, seed=12345)
+    numbers = policies.evaluation(library / "mcp-biped-heading.torchrl", episodes=2, seed=12345)
     assert f"{numbers['deterministic']['normalised_return']:.3f}" in card
     assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
 
@@ -99,12 +102,12 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
 def test_over_other_primitives_than_its_own_a_gate_is_neither_played_nor_published(run, library, monkeypatch, tmp_path):
     monkeypatch.setattr(builtin, "FOLDER", tmp_path)
     other = Path(shutil.copy(PRETRAINED, tmp_path))
-    _, agent, _ = experiment.restore(other, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(other, num_envs=1, seed=0)
     cfg = checkpoint.saved_config(other)
     next(agent.parts["primitives"].parameters()).data += 0.5
-    experiment.publish(agent.parts, cfg, other)
+    write_published(agent.parts, cfg, other)
     with pytest.raises(ValueError, match=r"needs other primitives than mcp-biped\.torchrl"):
-        experiment.restore(library / "mcp-biped-heading.torchrl", num_envs=1, seed=0)
+        policies.restore(library / "mcp-biped-heading.torchrl", num_envs=1, seed=0)
     said = refused(monkeypatch, publish, run, "--output", tmp_path / "again.torchrl")
     assert "trained over other primitives than mcp-biped.torchrl" in said
 
@@ -114,6 +117,20 @@ def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatc
     assert "end it with .torchrl" in refused(monkeypatch, publish, run, "--output", tmp_path / "a.zip")
 
 
+@pytest.mark.parametrize("character", ["biped", "humanoid", "trex"])
+def test_the_card_of_a_network_for_imitation_has_the_published_numbers(character):
+    network = PRETRAINED.with_name(f"mcp-{character}.torchrl")
+    card, root = network.with_suffix(".md").read_text(), PRETRAINED.parents[2]
+    assert f"networks/mcp-{character}.md" in (root / "docs" / "networks.md").read_text()
+    assert f"{network.stat().st_size / 1e6:.1f} MB" in card
+    with (root / "benchmarks" / "results" / "imitation.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["character"] == character]
+    for row in rows:
+        error, value = float(row["tracking_error"]), float(row["normalised_return"])
+        assert f"| {float(row['completed']):.0%} | {error:.3f} m | {value:.3f} (" in card
+        assert f"{int(row['frames']):,} steps" in card
+
+
 @pytest.mark.parametrize(
     "gate", sorted(filter(builtin.has_task, PRETRAINED.parent.glob("*.torchrl"))), ids=lambda p: p.stem
 )
@@ -121,6 +138,6 @@ def test_every_gate_that_comes_with_the_library_has_a_card_and_does_its_task(gat
     page = (gate.parents[2] / "docs" / "networks.md").read_text()
     assert gate.with_suffix(".md").is_file()
     assert f"networks/{gate.stem}.md" in page
-    numbers = experiment.evaluate_run(gate, episodes=4, seed=0, max_episode_steps=120)["deterministic"]
+    numbers = policies.evaluate_run(gate, episodes=4, seed=0, max_episode_steps=120)["deterministic"]
     assert numbers["terminated"] == 0.0
     assert numbers["reach"]["place"] > (0.5 if "heading" in gate.stem else 0.0)

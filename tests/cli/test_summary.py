@@ -22,8 +22,8 @@ def folder(tmp_path):
 
 def evaluate(folder):
     numbers = {"normalised_return": 0.75, "interval": [0.7, 0.8]}
-    exploring = {"normalised_return": 0.625, "interval": [0.6, 0.65]}
-    content = {"episodes": 128, "deterministic": numbers, "stochastic": exploring}
+    stochastic = {"normalised_return": 0.625, "interval": [0.6, 0.65]}
+    content = {"episodes": 128, "deterministic": numbers, "stochastic": stochastic}
     (folder / "evaluation.json").write_text(json.dumps(content))
 
 
@@ -32,7 +32,7 @@ def test_a_run_ends_with_its_returns_beside_the_papers_and_the_next_commands(fol
     lines = summary(folder).splitlines()
     assert lines[0] == f"run folder: {folder}"
     assert "128 episodes" in lines[1]
-    assert [line.split()[:2] for line in lines[2:4]] == [["deterministic", "0.750"], ["exploring", "0.625"]]
+    assert [line.split()[:2] for line in lines[2:4]] == [["deterministic", "0.750"], ["stochastic", "0.625"]]
     assert f"paper {TABLE_2['heading', 'biped', 'mcp'].mean:.3f}" in lines[4]
     commands = [line.split() for line in lines[lines.index("next:") + 1 :]]
     assert commands == [[f"torchrl-mcp-{name}", str(folder)] for name in ("play", "evaluate", "report")]

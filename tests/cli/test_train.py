@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra import compose, initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 
 import torchrl_mcp.conf
 from torchrl_mcp.cli.suggestions import suggestions
@@ -12,13 +13,25 @@ from torchrl_mcp.runs import benchmark
 
 CONF = Path(torchrl_mcp.conf.__file__).parent
 PARTS = ("hierarchy",)  # of one method's configuration, which takes both
-CHOICES = [f"{file.parent.name}={file.stem}" for file in sorted(CONF.glob("*/*.yaml")) if file.parent.name not in PARTS]
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_of_every_group_composes(choice):
+@pytest.fixture(autouse=True)
+def _no_other_test_runs_within_hydra(monkeypatch):
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+
+
+def rounds():
+    """Settings that take up every choice of every group, many groups at once, since composing takes long."""
+    groups = {folder.name: sorted(file.stem for file in folder.glob("*.yaml")) for folder in CONF.iterdir()}
+    groups = {name: found for name, found in groups.items() if found and name not in PARTS}
+    for number in range(max(map(len, groups.values()))):
+        yield [f"{name}={found[number]}" for name, found in groups.items() if number < len(found)]
+
+
+@pytest.mark.parametrize("choices", rounds(), ids=" ".join)
+def test_every_choice_of_every_group_composes(choices):
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        compose("train", [choice])
+        compose("train", choices)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +44,15 @@ def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypat
     printed = yaml.safe_load(capsys.readouterr().out)
     assert len(printed["practice"]["mixture"]) == mixture
     assert printed["run_dir"] == f"runs/{task}-{printed['character']['name']}/transfer/mcp/practice-{practice}/seed0"
+
+
+@pytest.mark.parametrize("words", [["--cfg", "hydra"], ["-c", "hydra"], ["--cfg=hydra"]])
+def test_hydras_own_settings_can_be_printed_with_all_references_resolved(monkeypatch, capsys, words):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "run_root=elsewhere", "--resolve", *words])
+    main()
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert printed["sweep"]["dir"] == "elsewhere/multirun"
+    assert "method" not in printed
 
 
 @pytest.mark.parametrize(

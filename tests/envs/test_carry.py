@@ -1,4 +1,5 @@
-import dataclasses
+"""Carrying: who takes the box, and how a joint then holds it."""
+
 import math
 
 import mujoco
@@ -9,9 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchrl_mcp.envs import Carry
-from torchrl_mcp.envs.characters import BIPED, CHARACTERS
+from torchrl_mcp.envs.characters import CHARACTERS
 
-FRONT = 0.065  # half-thickness of the biped's torso, a box
 HALF_SIZE = 0.15  # of the box
 GRAVITY = 9.81
 
@@ -25,18 +25,6 @@ def make(num_envs=2, character="biped", **kwargs):
     return Carry(character, num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 
 
-def ahead(env, gap, height=0.0):
-    """A state in which the source with the box is ``gap`` in front of the biped's torso, the target far away."""
-    env.reset()
-    state = env.get_state()
-    place = torch.tensor([FRONT + gap + HALF_SIZE, 0.0])
-    state["qpos"][:, -7:-5], state["mocap_pos"][:, 1, :2] = place, place
-    state["mocap_pos"][:, 0, :2] = torch.tensor([-5.0, 0.0])
-    state["qpos"][:, -4:] = state["mocap_quat"][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    state["qpos"][:, -5] += height
-    return state
-
-
 def play(env, carrier, num_steps, action=None):
     for _ in range(num_steps):
         carrier = env.step(carrier.set("action", torch.zeros(env.action_spec.shape) if action is None else action))
@@ -46,13 +34,6 @@ def play(env, carrier, num_steps, action=None):
 
 def joined(env):
     return env.simulation.state["eq_active"].flatten().tolist()
-
-
-def holding(env):
-    """The state after the torso has taken the box."""
-    play(env, env.reset(ahead(env, -0.002), set_state=True), 1)
-    assert joined(env) == [1.0] * env.num_envs
-    return env.get_state()
 
 
 def held_pose(env, index=0):
@@ -75,7 +56,7 @@ def force_on_the_ground(env, index=0):
 
 
 @pytest.mark.parametrize(("gap", "taken"), [(-0.002, 1.0), (0.002, 0.0)])
-def test_the_torso_takes_the_box_by_touching_it(gap, taken):
+def test_the_torso_takes_the_box_by_touching_it(gap, taken, ahead):
     env = make()
     play(env, env.reset(ahead(env, gap), set_state=True), 1)
     assert joined(env) == [taken] * 2
@@ -107,7 +88,7 @@ def test_every_character_can_take_the_box_by_walking_up_to_it(character):
     assert joined(env) == [1.0]
 
 
-def test_other_bodies_do_not_take_the_box():
+def test_other_bodies_do_not_take_the_box(ahead):
     env = make()
     state = ahead(env, 0.05)
     state["qpos"][:, 7:11] = torch.tensor([math.cos(0.2), 0.0, -math.sin(0.2), 0.0])  # leans back at the waist
@@ -127,7 +108,16 @@ def contacts(env):
     return [geom for pair in env.simulation.data(0).contact.geom if box in pair for geom in pair if geom != box]
 
 
-def test_the_joint_closes_without_a_jump():
+def test_a_box_that_does_not_stand_on_the_source_is_not_taken(ahead):
+    env = make(3)
+    state = ahead(env, -0.002)
+    state["mocap_pos"][0, 1, 2] -= 0.03
+    state["mocap_pos"][1, 1, 0] += 5
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [0.0, 0.0, 1.0]
+
+
+def test_the_joint_closes_without_a_jump(ahead):
     env, free = make(1), make(1)
     state = ahead(env, -0.001)
     angle = Rotation.from_euler("z", 0.02).as_quat()[[3, 0, 1, 2]]
@@ -150,7 +140,7 @@ def test_the_joint_closes_without_a_jump():
         assert np.abs(turned - turn).max() < 1e-3
 
 
-def test_the_weight_of_the_box_is_felt_while_it_is_held():
+def test_the_weight_of_the_box_is_felt_while_it_is_held(holding):
     env = make(2)
     state = holding(env)
     state["mocap_pos"][:, 1, 0] += 5  # the table is taken away
@@ -169,95 +159,7 @@ def test_the_weight_of_the_box_is_felt_while_it_is_held():
     assert env.simulation.state["qpos"][0, -5] > 1.1
 
 
-def over_the_target(env, clearance, shift=0.0):
-    """A state in which the box that is held is above the target."""
-    state = holding(env)
-    state["mocap_pos"][:, 1, 0] += 5
-    place = state["qpos"][:, -7:-4].clone()
-    place[:, 2] -= HALF_SIZE + clearance
-    place[:, 0] += shift
-    state["mocap_pos"][:, 0] = place
-    return state
-
-
-@pytest.mark.parametrize("clearance", [0.005, 0.05])
-def test_the_joint_opens_over_the_target_and_the_box_then_stands_there(clearance):
-    env = make()
-    carrier = env.reset(over_the_target(env, clearance), set_state=True)
-    carrier = play(env, carrier, 1)
-    assert joined(env) == [0.0, 0.0]
-    play(env, carrier, 20)
-    data = env.simulation.data(0)
-    assert data.body("box").xpos[2] - HALF_SIZE == pytest.approx(data.body("target").xpos[2], abs=2e-3)
-    assert np.abs(data.body("box").cvel).max() < 1e-2
-
-
-@pytest.mark.parametrize(("clearance", "shift"), [(0.08, 0.0), (0.005, 0.145)])
-def test_the_joint_stays_closed_above_the_target_and_beside_it(clearance, shift):
-    env = make()
-    play(env, env.reset(over_the_target(env, clearance, shift), set_state=True), 3)
-    assert joined(env) == [1.0, 1.0]
-
-
-def test_success_is_a_box_that_was_taken_and_put_down_on_the_target():
-    env = make(3)
-    state = over_the_target(env, 0.0)
-    state["eq_active"][1:] = 0
-    state["taken"][2] = 0
-    state["qpos"][:, 0] -= 1  # away from the box, which stands on the target: held, put down, and never taken
-    carrier = env.reset(state, set_state=True)
-    assert carrier["success"].flatten().tolist() == [False, True, False]
-    beside = state.clone()
-    beside["mocap_pos"][:, 0, 0] += 0.3
-    assert not env.reset(beside, set_state=True)["success"].any()
-    above = state.clone()
-    above["mocap_pos"][:, 0, 2] -= 0.03
-    assert not env.reset(above, set_state=True)["success"].any()
-
-
-def test_no_episode_begins_with_a_success():
-    env = make(500, object_distances=(0.5, 1.0), target_distances=(0.0, 0.5))
-    assert not env.reset()["success"].any()
-
-
-def test_tables_hold_the_box_and_touch_no_character():
-    model = make(1, "humanoid", self_collision=True).simulation.model
-    tops = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name in ("source", "target")]
-    box = model.geom("box").id
-    for top in tops:
-        meets = [
-            geom
-            for geom in range(model.ngeom)
-            if model.geom_contype[geom] & model.geom_conaffinity[top]
-            or model.geom_contype[top] & model.geom_conaffinity[geom]
-        ]
-        assert meets in ([box], [])  # a top, a leg
-    assert sum(bool(model.geom_contype[top]) for top in tops) == 2
-
-
-def test_a_box_that_was_put_down_is_not_taken_again_in_the_same_episode():
-    env = make()
-    play(env, env.reset(over_the_target(env, 0.005), set_state=True), 2)
-    state = env.get_state()
-    state["mocap_pos"] = state["mocap_pos"].flip(1)  # now the box stands on the source
-    assert (env.simulation.outputs["sensordata"] < 0).all()
-    play(env, env.reset(state, set_state=True), 3)
-    assert joined(env) == [0.0, 0.0]
-    state["taken"][1] = 0
-    play(env, env.reset(state, set_state=True), 1)
-    assert joined(env) == [0.0, 1.0]
-
-
-def test_a_box_that_does_not_stand_on_the_source_is_not_taken():
-    env = make(3)
-    state = ahead(env, -0.002)
-    state["mocap_pos"][0, 1, 2] -= 0.03
-    state["mocap_pos"][1, 1, 0] += 5
-    play(env, env.reset(state, set_state=True), 1)
-    assert joined(env) == [0.0, 0.0, 1.0]
-
-
-def test_a_partial_reset_opens_the_joint_of_its_own_simulation_only():
+def test_a_partial_reset_opens_the_joint_of_its_own_simulation_only(holding):
     env = make(3)
     state = holding(env)
     default = torch.from_numpy(env.simulation.model.eq_data)
@@ -272,7 +174,7 @@ def test_a_partial_reset_opens_the_joint_of_its_own_simulation_only():
         assert torch.equal(value[[0, 2]], state[key][[0, 2]]), key
 
 
-def test_a_restored_hold_continues_bit_for_bit():
+def test_a_restored_hold_continues_bit_for_bit(holding):
     env, other = make(2, terminate_on_fall=False), make(2, terminate_on_fall=False, seed=5)
     carrier = env.reset(holding(env), set_state=True)
     action = torch.rand(2, 17, generator=torch.Generator().manual_seed(0)) * 0.2 - 0.1
@@ -286,7 +188,7 @@ def test_a_restored_hold_continues_bit_for_bit():
     assert joined(env) == [1.0, 1.0]
 
 
-def test_a_simulation_is_looked_into_with_its_own_joint():
+def test_a_simulation_is_looked_into_with_its_own_joint(holding):
     env = make(2)
     state = holding(env)
     state["eq_data"][1, 0, 3] += 0.1
@@ -298,33 +200,3 @@ def test_a_simulation_is_looked_into_with_its_own_joint():
         strains.append(np.abs(data.efc_pos[weld]).max())
     assert strains[0] < 1e-3
     assert strains[1] == pytest.approx(0.1, abs=2e-3)
-
-
-def test_the_box_waits_on_the_source_as_it_is_turned():
-    env = make(8, object_distances=(3.0, 5.0))
-    carrier = env.reset()
-    state = env.get_state()
-    assert torch.equal(state["qpos"][:, -4:], state["mocap_quat"][:, 1])
-    assert state["mocap_quat"][:, :, 3].std() > 0.2
-    play(env, carrier, 30)
-    after = env.get_state()
-    assert (after["qpos"][:, -7:] - state["qpos"][:, -7:]).abs().max() < 1e-3
-    assert joined(env) == [0.0] * 8
-
-
-def test_no_box_begins_in_the_character_and_no_table_in_the_other():
-    env = make(2000, object_distances=(0.0, 1.0), target_distances=(0.0, 1.5))
-    env.reset()
-    target, source = env.simulation.state["mocap_pos"][:, :, :2].unbind(1)
-    corner = math.hypot(HALF_SIZE, HALF_SIZE)
-    arms_length = math.hypot(FRONT, 0.145)  # a corner of the torso
-    assert source.norm(dim=-1).min() >= arms_length + corner - 1e-9
-    distances = (target - source).norm(dim=-1)
-    assert distances.min() >= 2 * corner
-    assert distances.max() <= 1.5
-
-
-def test_a_character_without_a_carrier_is_refused(monkeypatch):
-    monkeypatch.setitem(CHARACTERS, "biped", dataclasses.replace(BIPED, carrier=None))
-    with pytest.raises(ValueError, match="character='biped' has no body to carry a box with: pass one of humanoid"):
-        make()

@@ -8,7 +8,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp.envs import Carry, Imitation
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.envs.rotations import about_z
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.training import checkpoint
 
@@ -28,7 +28,7 @@ class Guide:
         walk, terms = single_motion(character), {"pose": {"weight": 1.0, "scale": 1.0}}
         self.env = Imitation(character, walk, TRIALS, terms=terms, seed=0, num_threads=1)
         file = builtin("mcp", character)
-        agent = build.make_agent(experiment.policy_config(file), self.env)
+        agent = build.make_agent(policies.policy_config(file), self.env)
         checkpoint.load_agent(agent.parts, file)
         self.policy, self.walk = agent.actor.policy, walk
         self.times = 0.15 * torch.arange(TRIALS, dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training.trainer import Trainer
 
 TIMES = ("seconds", "time/")
@@ -34,7 +34,7 @@ def rows(folder):
 
 
 def final_parts(folder):
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
     return agent.parts.state_dict()
 
 
@@ -99,7 +99,7 @@ def test_transfer_of_options_trains_their_values_alone(tmp_path, pretrained):
 
 
 def test_all_primitives_learn_in_one_run(pretrained):
-    cfg, agent, _ = experiment.restore(pretrained["hierarchical"], num_envs=1, seed=0)
+    cfg, agent, _ = policies.restore(pretrained["hierarchical"], num_envs=1, seed=0)
     torch.manual_seed(cfg.seed)
     fresh = build.make_agent(cfg, build.make_env(cfg, num_envs=4, seed=0))
     for k in range(7):

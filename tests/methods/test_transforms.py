@@ -8,7 +8,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv, check_env_specs
 
 from torchrl_mcp.envs import Holdout
-from torchrl_mcp.methods.transforms import ClipAsOption, OptionMemory, TransformedCharacterEnv
+from torchrl_mcp.methods.transforms import ClipAsOption, CorrelatedNoise, OptionMemory, TransformedCharacterEnv
 
 LENGTHS = torch.tensor([[3], [5], [100]])
 
@@ -57,7 +57,11 @@ def remembering():
     return TransformedEnv(Lengths(), OptionMemory())
 
 
-@pytest.mark.parametrize("transform", [OptionMemory(), ClipAsOption(num_options=3)], ids=lambda t: type(t).__name__)
+@pytest.mark.parametrize(
+    "transform",
+    [OptionMemory(), ClipAsOption(num_options=3), CorrelatedNoise(2, 0.9)],
+    ids=lambda t: type(t).__name__,
+)
 def test_the_specs_hold_what_is_shown(transform):
     check_env_specs(TransformedEnv(Lengths(), transform))
 

@@ -1,6 +1,7 @@
 import csv
 import json
 from functools import partial
+from html.parser import HTMLParser
 
 import pytest
 from omegaconf import OmegaConf
@@ -15,6 +16,8 @@ def numbers(value, diagnostics):
     return {"normalised_return": value, "interval": interval, "metrics": {}, "diagnostics": diagnostics} | episodes
 
 
+VOID = {"meta", "br", "link", "img", "hr", "input"}
+GATES = {"gates/effective_primitives": 2.5, "gates/sum": 1.5, "gates/usage_0": 0.9, "gates/usage_1": 0.6}
 PAPERS_MCP = {
     "num_primitives": 8,
     "mixer__name": "multiplicative",
@@ -86,3 +89,72 @@ def write_run(run_writers, tmp_path):
 @pytest.fixture
 def write_mcp(run_writers, tmp_path):
     return run_writers(tmp_path / "runs")[1]
+
+
+@pytest.fixture(scope="session")
+def varied_runs(run_writers, tmp_path_factory):
+    """A folder of runs in all states, of several tasks, with an ablation."""
+    folder = tmp_path_factory.mktemp("runs")
+    write_run, write_mcp = run_writers(folder)
+    for seed, score in enumerate([0.4, 0.5, 0.9]):
+        write_run(f"scratch-{seed}", seed=seed, score=score)
+        write_mcp(f"mcp-{seed}", seed=seed, score=score / 2, diagnostics=GATES)
+        write_mcp(f"four-{seed}", seed=seed, score=0.3, num_primitives=4, diagnostics=GATES)
+    write_run("carry", task="carry", score=0.25, commit="fff0000")
+    write_mcp("carried", task="carry", score=0.125)
+    write_run("unfinished", task="carry", seed=1, progress=0.25)
+    write_mcp("waiting", method="moe", task="dribble", character="trex", mixer__name="additive")
+    write_mcp("pretraining", stage="pretrain", task="imitation", score=0.6)
+    (write_run("damaged|<b>", score=0.5) / "evaluation.json").write_text("{")
+    (write_run("lost", score=0.5) / "config.yaml").write_text("[")
+    return folder
+
+
+class Element:
+    def __init__(self, tag, attributes, parent):
+        self.tag, self.attributes, self.parent, self.children = tag, attributes, parent, []
+
+    @property
+    def text(self):
+        return " ".join("".join(c if isinstance(c, str) else f" {c.text} " for c in self.children).split())
+
+    def all(self, *tags):
+        for child in self.children:
+            if isinstance(child, Element):
+                if child.tag in tags or not tags:
+                    yield child
+                yield from child.all(*tags)
+
+
+class Tree(HTMLParser):
+    """The elements of a page; a tag that is closed out of turn is an error."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.root = self.open = Element("root", {}, None)
+        self.feed(text)
+        self.close()
+        assert self.open is self.root
+
+    def handle_starttag(self, tag, attrs):
+        assert len(dict(attrs)) == len(attrs)
+        element = Element(tag, dict(attrs), self.open)
+        self.open.children.append(element)
+        if tag not in VOID:
+            self.open = element
+
+    def handle_startendtag(self, tag, attrs):
+        self.open.children.append(Element(tag, dict(attrs), self.open))
+
+    def handle_endtag(self, tag):
+        assert tag == self.open.tag
+        self.open = self.open.parent
+
+    def handle_data(self, data):
+        self.open.children.append(data)
+
+
+@pytest.fixture(scope="session")
+def parse_page():
+    """A function from the text of a page to its root element."""
+    return lambda text: Tree(text).root

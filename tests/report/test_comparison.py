@@ -130,7 +130,7 @@ def test_a_single_seed_has_the_interval_of_its_episodes(write_run):
     (cell,) = grouped(write_run("a", score=0.5))
     assert (cell.mean().low, cell.mean().high) == (0.48, 0.52)
     assert math.isnan(cell.deviation())
-    assert cell.remarks == ["one seed, so that the interval is over its episodes"]
+    assert cell.remarks == ["one seed: the interval is over its episodes"]
 
 
 def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_run):
@@ -167,7 +167,7 @@ def test_caveats_tell_what_differs_between_cells(write_run, write_mcp):
         write_run("b", commit="bbb", total_frames=2000),
         write_mcp("c", commit="aaa", preset="paper", total_frames=3000),
     )
-    assert caveats(found) == ["presets: fast, paper", "commits: aaa, bbb", "steps of Scratch: 1,000, 2,000"]
+    assert caveats(found) == ["presets: fast, paper", "commits: aaa, bbb", "numbers of steps of Scratch: 1,000, 2,000"]
 
 
 def test_the_gap_is_our_mean_less_the_papers(write_mcp):

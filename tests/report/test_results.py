@@ -70,7 +70,7 @@ def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
         (
             "metrics.csv",
             "iteration,frames,seconds\n1,1e300,1\n",
-            "metrics.csv cannot be read: its frames are no numbers",
+            "metrics.csv cannot be read: its frames are not numbers",
         ),
         ("origin.json", '{"commit": [1]}', "origin.json cannot be read: its commit is"),
         ("origin.json", "", "origin.json cannot be read: Expecting value"),

@@ -25,10 +25,10 @@ def test_diagnostics_are_means_over_seeds_and_usage_is_that_of_a_run(write_run):
     [
         ({}, "gates", None),
         ({}, "options", None),
-        ({"gates/effective_primitives": 1.05}, "gates", "one does almost everything"),
-        ({"gates/sum": 1.95}, "gates", "all gates are open almost always"),
-        ({"options/effective_options": 1.05}, "options", "one does almost everything"),
-        ({"options/begin_rate": 0.95}, "options", "another begins at almost every step"),
+        ({"gates/effective_primitives": 1.05}, "gates", "one primitive does almost all the work"),
+        ({"gates/sum": 1.95}, "gates", "the gates are almost fully open, so they hardly select"),
+        ({"options/effective_options": 1.05}, "options", "one option does almost all the work"),
+        ({"options/begin_rate": 0.95}, "options", "a new option begins at almost every step"),
     ],
     ids=str,
 )

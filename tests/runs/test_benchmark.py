@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import benchmark, experiment
+from torchrl_mcp.runs import benchmark, policies
 
 BENCHMARKS = Path(conf.__file__).parent / "benchmark"
 CHARACTERS = {"ant", "biped", "humanoid", "trex"}
@@ -194,9 +194,7 @@ def test_a_benchmark_pretrains_transfers_and_evaluates(finished, capsys):
     pretraining, transfer, scratch = folders(finished)
     assert len(numbers(finished)) == 3
     assert OmegaConf.load(transfer / "config.yaml").pretrained == str(pretraining)
-    before, after = (
-        experiment.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (pretraining, transfer)
-    )
+    before, after = (policies.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (pretraining, transfer))
     assert all(torch.equal(before[name], after[name]) for name in before if name.startswith("primitives"))
     for run in (pretraining, transfer, scratch):
         evaluation = json.loads((run / "evaluation.json").read_text())

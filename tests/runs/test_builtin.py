@@ -4,7 +4,7 @@ from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build, builtin, experiment
+from torchrl_mcp.runs import build, builtin, experiment, policies
 from torchrl_mcp.training import checkpoint
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -30,13 +30,13 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def published(run, tmp_path_factory):
     path = tmp_path_factory.mktemp("published") / "mcp-biped.torchrl"
-    experiment.publish_run(run, path)
+    policies.publish_run(run, path)
     return path
 
 
 def act(path):
     """Actions of a checkpoint's policy in the same three states."""
-    _, agent, _ = experiment.restore(path, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(path, num_envs=1, seed=0)
     generator = torch.Generator().manual_seed(0)
     states = {key: torch.randn(3, size, generator=generator) for key, size in (("observation", 105), ("goal", 208))}
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -57,8 +57,8 @@ def test_primitives_are_transferred_from_what_comes_with_the_library(run, publis
     monkeypatch.setattr(builtin, "FOLDER", published.parent)
     transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
     folder = experiment.train(configure(tmp_path / "run", *transfer, "training.total_frames=128"))
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
-    _, original, _ = experiment.restore(run, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
+    _, original, _ = policies.restore(run, num_envs=1, seed=0)
     for name, parameter in agent.parts["primitives"].state_dict().items():
         assert torch.equal(parameter, original.parts["primitives"].state_dict()[name].bfloat16().float())
 
@@ -69,7 +69,7 @@ def test_pre_training_goes_on_from_another_with_other_motions(run, published, tm
         cfg = configure(tmp_path / "run", *settings, f"pretrained={origin}")
         env = build.make_env(cfg, num_envs=1, seed=0)
         assert len(env.library) == 7
-        agent, other = build.make_agent(cfg, env, origin), experiment.restore(origin, num_envs=1, seed=0)[1]
+        agent, other = build.make_agent(cfg, env, origin), policies.restore(origin, num_envs=1, seed=0)[1]
         for name in set(agent.parts) - missing:
             assert parameters(agent.parts[name]) == parameters(other.parts[name])
     folder = experiment.train(cfg)
@@ -101,6 +101,6 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
     ids=lambda path: path.stem,
 )
 def test_what_comes_with_the_library_follows_its_motions(path):
-    results = experiment.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
+    results = policies.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25
     assert results["deterministic"]["metrics"]["tracking_error"] < 0.15

@@ -4,7 +4,6 @@ import hashlib
 import json
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,17 +14,11 @@ from torch import nn
 
 from torchrl_mcp import conf
 from torchrl_mcp.cli import evaluate, train
-from torchrl_mcp.runs import benchmark, experiment
+from torchrl_mcp.runs import benchmark, experiment, policies
 from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
-
-
-def command(name, *arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", f"torchrl_mcp.cli.{name}", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
-    )
 
 
 def configure(*overrides):
@@ -38,7 +31,7 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     assert command("train", *FAST, "task.pretrain.max_episode_steps=100", cwd=folder).returncode == 0
     return folder / "runs/holdout-ant/pretrain/mcp/preset-smoke_task.pretrain.max_episode_steps-100/seed0"
@@ -55,18 +48,18 @@ def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run)
     assert "hydra/launcher" not in origin["choices"]
 
 
-def test_a_multirun_makes_a_folder_per_job(tmp_path):
+def test_a_multirun_makes_a_folder_per_job(command, tmp_path):
     outcome = command("train", "-m", *FAST, "mixer=multiplicative,additive", "training.total_frames=128", cwd=tmp_path)
     assert outcome.returncode == 0, outcome.stderr
     assert len(list(tmp_path.rglob("metrics.csv"))) == 2
 
 
-def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run, tmp_path):
-    outcome = command("evaluate", run, "--episodes", 100, "--output", tmp_path / "numbers.json", cwd=tmp_path)
+def test_evaluation_reports_as_many_episodes_as_asked_and_writes_them_down(command, run, tmp_path):
+    outcome = command("evaluate", run, "--episodes", 20, "--output", tmp_path / "numbers.json", cwd=tmp_path)
     assert outcome.returncode == 0, outcome.stderr
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     for mode in ("deterministic", "stochastic"):
-        assert numbers[mode]["episodes"] == 100
+        assert numbers[mode]["episodes"] == 20
         assert f"normalised return {numbers[mode]['normalised_return']:.3f}" in outcome.stdout
         # Holdout normalises by 6 per step, evaluated over 200 steps, though this run was trained on 100.
         assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / (6 * 200), rel=1e-4)
@@ -91,7 +84,7 @@ def test_evaluation_reports_at_least_a_hundred_episodes_and_writes_them_down(run
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_mistake_is_answered_with_what_to_write_instead(tmp_path, arguments, remedy):
+def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arguments, remedy):
     outcome = command("train", *FAST, *arguments, cwd=tmp_path)
     assert outcome.returncode != 0
     assert remedy in outcome.stderr
@@ -99,7 +92,7 @@ def test_a_mistake_is_answered_with_what_to_write_instead(tmp_path, arguments, r
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(run):
+def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(command, run):
     before = contents(run)
     outcome = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
     assert outcome.returncode != 0
@@ -107,7 +100,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(run)
     assert contents(run) == before
 
 
-def test_transfer_from_another_architecture_is_refused(run, tmp_path):
+def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
     outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
     assert outcome.returncode != 0
     assert "different method, character, task or network size" in outcome.stderr
@@ -119,7 +112,7 @@ def flip_a_byte(data):
 
 
 @pytest.mark.parametrize("damage", [flip_a_byte, lambda data: data[:1000], lambda data: b"something else"])
-def test_damage_of_all_checkpoints_stops_a_resume_and_leaves_the_run_folder_untouched(run, tmp_path, damage):
+def test_damage_of_all_checkpoints_stops_a_resume_and_leaves_the_run_folder_untouched(command, run, tmp_path, damage):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     for file in (copy / "checkpoints").iterdir():
@@ -134,7 +127,7 @@ def test_damage_of_all_checkpoints_stops_a_resume_and_leaves_the_run_folder_unto
     assert contents(copy) == before
 
 
-def test_a_resume_of_no_run_says_what_is_missing(tmp_path):
+def test_a_resume_of_no_run_says_what_is_missing(command, tmp_path):
     outcome = command("train", "resume=nowhere", cwd=tmp_path)
     assert outcome.returncode != 0
     assert "nowhere holds no run" in outcome.stderr
@@ -210,8 +203,8 @@ def test_a_run_of_another_version_is_refused_with_the_name_it_misses_and_the_rem
     readers = [
         (folder / "config.yaml", lambda: experiment.resume(folder)),
         (folder / "config.yaml", lambda: experiment.is_complete(folder)),
-        (file, lambda: experiment.restore(file, num_envs=1, seed=0)),
-        (file, lambda: experiment.evaluation(file, episodes=1, seed=0)),
+        (file, lambda: policies.restore(file, num_envs=1, seed=0)),
+        (file, lambda: policies.evaluation(file, episodes=1, seed=0)),
     ]
     for source, read in readers:
         with pytest.raises(ValueError, match=re.escape(f"{source} is of another version of torchrl-mcp")) as refusal:

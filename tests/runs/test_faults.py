@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_mcp.runs import experiment, lock
+from torchrl_mcp.runs import experiment, lock, policies
 from torchrl_mcp.runs.status import status
 from torchrl_mcp.training import checkpoint, run_folder
 
@@ -93,7 +93,7 @@ def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_o
     assert f"{newest} is damaged: the run goes on from checkpoint-000000000384.torchrl" in said
     assert newest.with_name(f"{newest.name}.damaged").exists()
     assert rows(killed) == rows(whole)
-    expected, parts = (experiment.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (whole, killed))
+    expected, parts = (policies.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (whole, killed))
     for name, value in expected.items():
         assert torch.equal(parts[name], value), name
 
@@ -172,8 +172,8 @@ def test_code_that_a_run_folder_or_a_checkpoint_names_is_not_run(killed, tmp_pat
             target.writestr(name, content)
     for use in (
         lambda: experiment.resume(killed),
-        lambda: experiment.restore(killed, num_envs=1, seed=0),
-        lambda: experiment.evaluation(newest, episodes=1, seed=0),
+        lambda: policies.restore(killed, num_envs=1, seed=0),
+        lambda: policies.evaluation(newest, episodes=1, seed=0),
     ):
         with pytest.raises(ValueError, match=r"would run torch.utils.collect_env.run, .* pass --trust"):
             use()

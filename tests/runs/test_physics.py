@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_module
 
 from torchrl_mcp.envs import Heading, engines
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training import checkpoint
 
 
@@ -65,5 +65,5 @@ def test_a_run_trains_is_evaluated_by_mujoco_and_resumes_to_the_same_numbers(tmp
     checkpoint.find(run).unlink()
     experiment.resume(run)
     assert rows(run) == recorded
-    _, _, env = experiment.restore(run, num_envs=2, seed=0)
+    _, _, env = policies.restore(run, num_envs=2, seed=0)
     assert env.simulation.state["qpos"].dtype == torch.float64

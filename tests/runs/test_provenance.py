@@ -50,6 +50,7 @@ def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tm
 
 def test_provenance_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
+    monkeypatch.setattr(build.HydraConfig, "initialized", lambda: False)
     command, choices = build.launched()
     where_from = provenance.provenance("cpu", command, choices, Precision(True, "as measured"))
     content = json.loads(json.dumps(where_from))

@@ -107,7 +107,7 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
 
 
 def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):
-    cfg = configure(tmp_path, "method=option_critic")
+    cfg = configure(tmp_path, "method=option_critic", "epsilon=1")
     source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2, num_threads=1)
     policy, watch = build.make_agent(cfg, source.env).actor.policy, Stopwatch()
     source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=False, stopwatch=watch)
@@ -116,7 +116,7 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     assert batch.shape == (4, 20)
     for key in ("observation", "action"):
         assert len(batch[key][:, 0].unique(dim=0)) == 4
-    assert batch["option"].unique().numel() > 2
+    assert batch["option"].unique().numel() > 4  # of eight, chosen at random
     assert batch["held_option"][:, 1:].equal(batch["option"][:, :-1])
     assert watch.seconds["collection"] > 0
 

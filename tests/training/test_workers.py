@@ -1,6 +1,8 @@
 """Worker processes: their end is noticed, and none stays behind."""
 
 import multiprocessing
+import subprocess
+import sys
 import threading
 import time
 
@@ -8,6 +10,17 @@ import pytest
 
 from torchrl_mcp.runs.processes import start
 from torchrl_mcp.training.workers import attend, end, new_workers
+
+COMMAND = """
+import multiprocessing, time
+from torchrl_mcp.cli.train import main
+if __name__ == "__main__":
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    worker.start()
+    print(worker.pid, flush=True)
+    time.sleep(60)
+"""
+"""A command line that imports what ``torchrl-mcp-train`` does, with a worker that sleeps in place of its imports."""
 
 
 def for_ever():
@@ -54,3 +67,16 @@ def test_workers_of_a_start_that_fails_are_ended_and_others_are_left_alone():
     assert not started[0].is_alive()
     assert bystander.is_alive()
     end([bystander])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
+def test_a_worker_of_the_command_ends_with_it_also_before_its_own_imports_are_over(tmp_path):
+    (tmp_path / "command.py").write_text(COMMAND)
+    command = subprocess.Popen([sys.executable, tmp_path / "command.py"], stdout=subprocess.PIPE, text=True)
+    assert int(command.stdout.readline()) != command.pid
+    time.sleep(1.0)
+    command.kill()
+    command.wait()
+    began = time.monotonic()
+    assert command.stdout.read() == ""  # the worker has the other end of the pipe until it ends
+    assert time.monotonic() - began < 20

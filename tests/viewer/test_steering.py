@@ -11,7 +11,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs import Carry, Dribble, Heading
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.experiment import restore
+from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.steering import Steering
 

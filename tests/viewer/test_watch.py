@@ -6,7 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import experiment, policies
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.viewer.watch import Watch
 
@@ -29,12 +29,12 @@ def numbers(parts):
 
 
 def of(path):
-    return numbers(experiment.restore(path, num_envs=1, seed=0)[1].parts)
+    return numbers(policies.restore(path, num_envs=1, seed=0)[1].parts)
 
 
 def test_each_new_checkpoint_is_taken_up_and_a_damaged_one_is_passed_over(run, capsys):
     folder, earlier, later = run
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
     watch = Watch(folder, agent.parts, interval=0.0)
     assert watch()
     assert watch.frames == run_folder.frames(earlier) == 256
@@ -61,11 +61,11 @@ def test_each_new_checkpoint_is_taken_up_and_a_damaged_one_is_passed_over(run, c
 
 def test_a_checkpoint_of_other_networks_changes_nothing(run, tmp_path):
     folder, earlier, later = run
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
     watch = Watch(folder, agent.parts, interval=0.0)
     watch()
     before = copy.deepcopy(agent.parts.state_dict())
-    other = experiment.restore(later, num_envs=1, seed=0)[1].parts
+    other = policies.restore(later, num_envs=1, seed=0)[1].parts
     other["critic"] = torch.nn.Linear(1, 1)
     checkpoint.run_checkpoint(other).save(earlier.with_name(later.name), metadata={"config": {}})
     assert not watch()
@@ -74,7 +74,7 @@ def test_a_checkpoint_of_other_networks_changes_nothing(run, tmp_path):
 
 def test_the_folder_is_looked_at_every_so_often(run):
     folder, earlier, later = run
-    _, agent, _ = experiment.restore(folder, num_envs=1, seed=0)
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
     watch = Watch(folder, agent.parts, interval=60.0)
     assert watch()
     later.rename(earlier.with_name(later.name))

@@ -19,7 +19,7 @@ from torchrl_mcp.envs import Heading
 from torchrl_mcp.viewer.guard import refusal
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.steering import Steering
-from torchrl_mcp.viewer.web import KEYS, Deed, Hands, Pace, Stage, play_in_browser
+from torchrl_mcp.viewer.web import KEYS, BrowserEvent, BrowserInput, Pace, StudioApp, play_in_browser
 
 IDLE = TensorDictModule(lambda goal: torch.zeros(len(goal), 17), in_keys=["goal"], out_keys=["action"])
 
@@ -90,20 +90,20 @@ def test_a_page_shows_the_character_while_it_plays(monkeypatch, tmp_path):
 
 def test_what_is_beside_the_simulation_is_drawn_where_it_is():
     player = Brief()
-    stage = Stage(Steering(player), distance=3.0)
-    stage.viewer, stage.shapes = SimpleNamespace(extra_geoms=["an old one"]), player.shapes
-    stage.on_update(None)
-    [geom], [shape] = stage.viewer.extra_geoms, player.shapes
+    app = StudioApp(Steering(player), distance=3.0)
+    app.viewer, app.shapes = SimpleNamespace(extra_geoms=["an old one"]), player.shapes
+    app.on_update(None)
+    [geom], [shape] = app.viewer.extra_geoms, player.shapes
     np.testing.assert_allclose(geom.pos, shape.position, rtol=1e-6)
     np.testing.assert_allclose(geom.rgba, shape.colour)
 
 
 def test_the_camera_follows_the_first_body():
     player = Brief()
-    stage = Stage(Steering(player), distance=3.0)
-    stage.viewer = SimpleNamespace(model=player.env.simulation.model, camera=mujoco.MjvCamera())
-    stage.align_camera()
-    camera = stage.viewer.camera
+    app = StudioApp(Steering(player), distance=3.0)
+    app.viewer = SimpleNamespace(model=player.env.simulation.model, camera=mujoco.MjvCamera())
+    app.align_camera()
+    camera = app.viewer.camera
     assert (camera.type, camera.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
     assert camera.distance == 3.0
 
@@ -122,13 +122,13 @@ def test_what_is_done_in_the_browser_is_done_to_the_player():
     from mujoco.experimental.studio import messages
 
     steering = Steering(Brief())
-    hands = Hands(steering)
-    hands.on_deed(Deed(lambda steering: steering.aim(1.0)))
+    browser = BrowserInput(steering)
+    browser.on_browser_event(BrowserEvent(lambda steering: steering.aim(1.0)))
     assert steering.direction == 1.0
-    hands.on_deed(Deed(KEYS[imgui.Key.LeftArrow]))
+    browser.on_browser_event(BrowserEvent(KEYS[imgui.Key.LeftArrow]))
     assert steering.direction == pytest.approx(1.0 + math.radians(15))
     steering.step()
-    hands.on_reset(messages.ResetEvent(key=-1))
+    browser.on_reset(messages.ResetEvent(key=-1))
     assert steering.player.began
 
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_mcp.envs import Dribble, Heading
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import Steering
-from torchrl_mcp.viewer.window import LENGTH, as_text, grasp, play_in_window
+from torchrl_mcp.viewer.window import LENGTH, apply_mouse, as_text, play_in_window
 
 GATED = TensorDictModule(
     lambda goal: (torch.zeros(len(goal), 17), torch.tensor([[1.0, 0.5]])),
@@ -89,14 +89,14 @@ def test_what_the_mouse_drags_is_pushed_and_where_it_chose_the_ground_the_target
     data, hand = mujoco.MjData(model), mujoco.MjvPerturb()
     mujoco.mj_forward(model, data)
     hand.localpos[:] = 2.0, 1.0, 0.0
-    grasp(steering, model, data, hand)
+    apply_mouse(steering, model, data, hand)
     assert steering.place == (2.0, 1.0)
     pushed = ball.env.simulation.state["xfrc_applied"][0]
     assert not pushed.any()
     torso = model.body("torso").id
     hand.select, hand.active, hand.localmass = torso, int(mujoco.mjtPertBit.mjPERT_TRANSLATE), 1.0
     hand.localpos[:], hand.refselpos[:] = 0.0, data.xpos[torso] + [0.0, 0.5, 0.0]
-    grasp(steering, model, data, hand)
+    apply_mouse(steering, model, data, hand)
     force = pushed[torso, :3].numpy()
     assert force[1] > 1.0  # towards the hand
     assert np.abs(force[[0, 2]]).max() < 1e-6 * force[1]

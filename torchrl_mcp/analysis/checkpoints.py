@@ -17,54 +17,54 @@ from torchrl_mcp.envs import CharacterEnv, Heading, Imitation
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.methods.actor import PRIMITIVES, Explorer
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, policies
 from torchrl_mcp.training import checkpoint, run_folder
 
 UNTRAINED = 10
-"""Networks before training, whose mean numbers are put beside those of trained ones."""
+"""Number of untrained networks whose mean is compared with trained networks."""
 
 SPACING = math.radians(7.5)
-"""Between the target directions of trajectories."""
+"""Angle between the target directions of trajectories, in radians."""
 
 
 def walk_of(
     path: Path, *, clip: str | None, walkers: int, seconds: float, seed: int
 ) -> tuple[Walk, Mapping[str, float]]:
-    """Return how a checkpoint of imitation walks, and how far untrained networks in its place specialise.
+    """Return a walk of an imitation checkpoint, and the specialisation of untrained networks on the same states.
 
     Args:
-        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
-        clip: Name of the generated motion to follow, or None for the one straight ahead.
-        walkers: Characters, side by side.
-        seconds: Duration of the walk.
-        seed: Of the environments.
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        clip: Name of the generated motion to follow, or None for walking straight ahead.
+        walkers: Number of simulations.
+        seconds: Duration of the walk in seconds.
+        seed: Seed of the environments.
 
     Raises:
         ValueError: If the run is of another task, has no weights of primitives, or cannot walk.
     """
-    cfg = experiment.policy_config(path)
+    cfg = policies.policy_config(path)
     if cfg.task.name != "imitation":
         raise ValueError(
             f"{path} is of task={cfg.task.name}: Figure 7 is of pre-training, give a run of task=imitation"
         )
-    _, agent, _ = experiment.restore(path, num_envs=1, seed=seed)
+    _, agent, _ = policies.restore(path, num_envs=1, seed=seed)
     if "gates" not in agent.actor.stored:
         raise ValueError(f"{path} is of method={cfg.method.name}, which has no weights: give a run of one with gates")
     clips = single_motion(cfg.character.name, clip)
-    cfg, agent, env = experiment.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
+    cfg, agent, env = policies.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
     walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
     return walk, untrained(cfg, agent, cast("Imitation", env), walk)
 
 
 @torch.no_grad()
 def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk) -> Mapping[str, float]:
-    """Return how far networks before training specialise in the states of a walk: means of :data:`UNTRAINED` of them.
+    """Return the mean specialisation of :data:`UNTRAINED` untrained networks in the states of a walk.
 
     Args:
-        cfg: Configuration of their method.
-        agent: A trained agent of it, whose normalisers they share.
-        env: Environments of its sizes.
-        walk: That of the trained agent.
+        cfg: Configuration of the run.
+        agent: The trained agent, for its normalisers.
+        env: Environments of the run's task.
+        walk: Walk of the trained agent.
     """
     numbers = []
     for seed in range(UNTRAINED):
@@ -83,13 +83,13 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
     """Return the random explorer of a method, as in Section 5.3.
 
     Args:
-        cfg: Its configuration.
-        agent: Its networks.
-        num: Simulations that explore.
+        cfg: Configuration of the run.
+        agent: Networks of the run.
+        num: Number of simulations.
         generator: Source of randomness.
 
     Raises:
-        ValueError: If the method has none.
+        ValueError: If the method has no explorer.
     """
     if cfg.method.explorer is None:
         raise ValueError(
@@ -106,15 +106,15 @@ def explorer_title(cfg: DictConfig) -> str:
 
 
 def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[CharacterEnv, TensorDictBase]:
-    """Return environments to explore, and the state in which all begin: in the middle of a walk, if it is known.
+    """Return environments for exploration and their common initial state, in the middle of a walk if possible.
 
-    Episodes end with a fall or when the time is up.
+    Episodes end with a fall or at the time limit.
 
     Args:
-        cfg: Configuration of any run of the character.
+        cfg: Configuration of any run with the character.
         num: Number of simulations.
-        seconds: Duration of an episode.
-        seed: Of the environments.
+        seconds: Duration of an episode in seconds.
+        seed: Seed of the environments.
     """
     name = cfg.character.name
     if name in CHARACTERS:
@@ -131,22 +131,22 @@ def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[Cha
 
 
 def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
-    """Return where a policy of the holdout task goes: on held-out directions, before transfer on those it saw as well.
+    """Return trajectories of a holdout policy: on held-out directions and, of pre-training, on seen directions.
 
     Args:
-        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
-        seed: Of the environments.
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        seed: Seed of the environments.
 
     Returns:
-        Trajectories by a name that says when and where; of a run that is not over, that it is not.
+        Trajectories by a title with stage and directions, which marks runs that are still training.
     """
-    cfg, panels = experiment.policy_config(path), {}
+    cfg, panels = policies.policy_config(path), {}
     over = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):
         low, high = cfg.task.directions[shown]
         directions = torch.linspace(low, high, round((high - low) / SPACING) + 1, dtype=torch.float64)
-        _, agent, env = experiment.restore(path, num_envs=len(directions), seed=seed)
+        _, agent, env = policies.restore(path, num_envs=len(directions), seed=seed)
         how = (
             ("as pre-trained" if over else "in pre-training") if pretrained else f"{'after' if over else 'in'} transfer"
         )

@@ -28,8 +28,8 @@ class Curve:
         label: Name of the method.
         frames: Environment steps, ``(T,)``.
         mean: Mean over seeds, ``(T,)``.
-        low: Least of the seeds, ``(T,)``.
-        high: Greatest of the seeds, ``(T,)``.
+        low: Minimum over seeds, ``(T,)``.
+        high: Maximum over seeds, ``(T,)``.
         seeds: Number of seeds.
     """
 
@@ -44,12 +44,12 @@ class Curve:
 def learning_curves(
     groups: Mapping[str, Sequence[Path]], *, quantity: str = NORMALISED_RETURN, num_bins: int = 50
 ) -> list[Curve]:
-    """Return one curve per group on a common grid of steps, for what every seed of the group has reached.
+    """Return one curve per group on a common grid of steps, up to the steps that every seed of the group has reached.
 
-    Steps are divided into ``num_bins`` equal bins up to the last value of the longest run. A bin holds the mean of a
-    run's rows, weighted by ``episode/count`` where the quantity is a mean over episodes. Bins in which no episode ended
-    are interpolated, and a run's last is left out if it covers less than half of it. A bin should be no shorter than an
-    episode of all environments together: in a shorter one the episodes that failed early can be among themselves.
+    Steps are divided into ``num_bins`` equal bins up to the last value of the longest run. The value of a bin is the
+    mean of a run's rows, weighted by ``episode/count`` if the quantity is a mean over episodes. Bins without the end of
+    an episode are interpolated, and a run's last bin is left out if the run covers less than half of it. A bin should
+    be at least as long as an episode of all environments together: a shorter one can hold early failures only.
 
     Args:
         groups: Run folders, one per seed, by the label of their curve.
@@ -57,7 +57,7 @@ def learning_curves(
         num_bins: Number of bins.
 
     Raises:
-        ValueError: If a run has no such column, or a group no run.
+        ValueError: If a run lacks the column, or a group has no run.
     """
     runs = {label: [_points(Path(folder), quantity) for folder in folders] for label, folders in groups.items()}
     if empty := [label for label, points in runs.items() if not points]:
@@ -98,13 +98,13 @@ def plot_curves(
     """Plot curves as lines, each with the range of its seeds as a band around it.
 
     Args:
-        axes: Where to.
+        axes: Axes to draw on.
         curves: The curves.
-        styles: Matplotlib's ``color`` and other properties of each line; without it, the colours of all figures.
-        xlabel: What the steps are.
-        ylabel: What the quantity is.
+        styles: Matplotlib's ``color`` and other properties of each line, by default the colours of all figures.
+        xlabel: Label of the steps.
+        ylabel: Label of the quantity.
     """
-    # Where colours repeat, dashes tell lines apart.
+    # When colours repeat, dashes distinguish lines.
     lines = product(("-", "--", ":"), COLOURS)
     styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
@@ -125,7 +125,7 @@ def _legend(curve: Curve) -> str:
 
 
 def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
-    """Steps, values and weights of the rows that have the quantity, each ``(R,)``."""
+    """Steps, values and weights of the rows with a finite quantity, each ``(R,)``."""
     rows = read_metrics(run)
     if not rows or quantity not in rows[0]:
         raise ValueError(f"{run} has no {quantity!r} in metrics.csv: the columns are {sorted(rows[0]) if rows else []}")
@@ -144,7 +144,7 @@ def _binned(frames: Array, values: Array, weights: Array, edges: Array) -> Array
     total, mass = (np.bincount(index, x, minlength=len(edges) - 1) for x in (weights * values, weights))
     bins = np.arange(len(edges) - 1)
     full = mass > 0
-    last = index.max()  # of which less than half says little
+    last = index.max()  # dropped if the run covers less than half of it
     if full[:last].any() and frames.max() < (edges[last] + edges[last + 1]) / 2:
         full[last] = False
     return np.interp(bins, bins[full], total[full] / mass[full], left=np.nan, right=np.nan)

@@ -28,11 +28,11 @@ SPACING = 0.2
 
 @dataclass(frozen=True)
 class Exploration:
-    """Paths of characters that began in the same state.
+    """Paths of characters from a common initial state.
 
     Attributes:
-        positions: Horizontal position of the root in metres from where it began, ``(T + 1, N, 2)``; NaN after the end.
-        ended: Whether each fell before the time was up, ``(N,)``.
+        positions: Horizontal position of the root in metres from its start, ``(T + 1, N, 2)``; NaN after the end.
+        ended: Whether each character fell before the time limit, ``(N,)``.
         timestep: Seconds between two positions.
     """
 
@@ -42,18 +42,18 @@ class Exploration:
 
     @property
     def seconds(self) -> Array:
-        """How long each character stayed up, ``(N,)``."""
+        """Seconds for which each character stayed upright, ``(N,)``."""
         steps = np.isfinite(self.positions[..., 0]).sum(0) - 1
-        # The position of the last step of an episode is not known.
+        # The position after an episode's last step is unknown.
         return (steps + 1) * self.timestep
 
 
 def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> Explorer:
-    """Play Gaussian noise about the action 0, which for characters under PD control is their rest pose.
+    """Return an explorer that plays Gaussian noise around action 0, the rest pose of characters under PD control.
 
     Args:
         action_dim: Size of the action, ``A``.
-        std: Of the noise, in action units.
+        std: Standard deviation of the noise, in action units.
         generator: Source of randomness.
     """
     return lambda state: std * torch.randn(len(state), action_dim, generator=generator)
@@ -65,10 +65,10 @@ def explore(
     """Play one episode in each environment.
 
     Args:
-        explorer: What acts.
-        normaliser: From states as observed to those that the explorer sees.
-        env: Environments whose episodes end by a fall or the time limit.
-        start: State in which all begin.
+        explorer: The explorer that acts.
+        normaliser: From observed states to normalised states for the explorer.
+        env: Environments whose episodes end with a fall or at the time limit.
+        start: Common initial state.
     """
     policy = TensorDictModule(
         lambda observation: explorer(normaliser(observation)), in_keys=["observation"], out_keys=["action"]
@@ -80,11 +80,11 @@ def explore(
 
 
 def path_statistics(exploration: Exploration) -> dict[str, float]:
-    """Say how far exploration leads.
+    """Summarise the extent of exploration.
 
-    ``upright`` is the share of characters that did not fall, ``seconds`` the median time until they did or the time was
-    up, ``distance`` the median of the greatest distance from the origin in metres, and ``spread`` the circular variance
-    of the directions in which characters last were, 0 where all went the same way and 1 where they went all ways alike.
+    ``upright`` is the share of characters that did not fall, ``seconds`` the median time until the fall or the time
+    limit, ``distance`` the median of the greatest distance from the origin in metres, and ``spread`` the circular
+    variance of the final directions from the origin: 0 if all are the same, 1 if they are uniform.
     """
     distances = np.linalg.norm(exploration.positions, axis=-1)
     angles = np.arctan2(*_last(exploration.positions).T[::-1])
@@ -98,7 +98,7 @@ def path_statistics(exploration: Exploration) -> dict[str, float]:
 
 
 def path_rows(exploration: Exploration) -> list[dict[str, float]]:
-    """Return where every character was, every :data:`SPACING` seconds until its end."""
+    """Return the position of every character, every :data:`SPACING` seconds until its end."""
     every = max(1, round(SPACING / exploration.timestep))
     return [
         {"trajectory": number, "seconds": round(step * exploration.timestep, 3), "x": round(x, 3), "y": round(y, 3)}
@@ -109,11 +109,11 @@ def path_rows(exploration: Exploration) -> list[dict[str, float]]:
 
 
 def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure:
-    """Draw paths from above, each panel under its name, all on one scale, and enlarged where they are short.
+    """Draw paths from above, one panel per exploration on a common scale, with an enlargement of short paths.
 
     Args:
-        panels: By name.
-        title: Says who explores.
+        panels: Explorations by name.
+        title: Title of the figure.
     """
     points = np.concatenate([panel.positions.reshape(-1, 2) for panel in panels.values()])
     low, high = np.nanmin(points, 0), np.nanmax(points, 0)

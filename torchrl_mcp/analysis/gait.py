@@ -1,4 +1,4 @@
-"""Strides and their phases, found from the feet on the ground alone, without the reference motion."""
+"""Strides and their phases, from foot contacts alone, without the reference motion."""
 
 from itertools import pairwise
 
@@ -12,17 +12,17 @@ from torchrl_mcp.envs.motions.kinematics import body_names
 from torchrl_mcp.envs.pd_character import PDCharacterEnv, falling_geoms, lowest_points
 
 CLEARANCE = 0.003
-"""Metres below which a foot stands: one that has just touched down bounces by less."""
+"""Height in metres below which a foot stands; the bounce after touch-down is lower."""
 
 STEADY = 7
-"""Control steps, odd. Of that many, more than half decide whether a foot stands: shorter flickers are none."""
+"""Odd number of control steps of a majority vote on whether a foot stands, which removes flicker."""
 
 
 class Feet:
-    """A detector of the feet that stand on the ground.
+    """Detects which feet stand on the ground.
 
     Args:
-        env: The characters. Only shapes of their feet and how they lie are looked at.
+        env: The characters. Only the shapes and poses of their feet are used.
     """
 
     def __init__(self, env: PDCharacterEnv) -> None:
@@ -35,7 +35,7 @@ class Feet:
         self._outputs = env.simulation.outputs
 
     def standing(self) -> Tensor:
-        """Whether the right and the left foot stand, as they are now, ``(N, 2)``, bool."""
+        """Whether the right and the left foot stand now, ``(N, 2)``, bool."""
         heights = self._outputs["geom_xpos"][:, self._geoms, 2]
         vertical = self._outputs["geom_xmat"][:, self._geoms, 6:]
         down = lowest_points(heights, vertical, self._half_sizes, self._radii) < CLEARANCE
@@ -43,15 +43,15 @@ class Feet:
 
 
 def stride_phases(standing: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return where in its stride a walker is: 0 where the right foot touches down, and 1 where it does again.
+    """Return the phase of the stride: 0 when the right foot touches down, and 1 when it does so again.
 
-    A stride in which the left foot does not touch down exactly once is none.
+    A stride counts only if the left foot touches down exactly once in it.
 
     Args:
         standing: Whether the right and the left foot stand, one row per control step, ``(T, 2)``.
 
     Returns:
-        Phases in [0, 1), ``(T,)``; NaN outside of complete strides.
+        Phases in [0, 1), ``(T,)``; NaN outside complete strides.
     """
     right, left = (touch_downs(foot) for foot in np.asarray(standing).T)
     phases = np.full(len(standing), np.nan)
@@ -62,10 +62,10 @@ def stride_phases(standing: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def touch_downs(standing: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the steps in which a foot begins to stand; it does so for most of :data:`STEADY` steps around each.
+    """Return the steps at which a foot begins to stand, after a majority vote over :data:`STEADY` steps.
 
     Args:
-        standing: Whether it stands, ``(T,)``.
+        standing: Whether the foot stands, ``(T,)``.
     """
     around = sliding_window_view(np.pad(standing, STEADY // 2, mode="edge"), STEADY)
     steady = around.sum(-1) > STEADY // 2

@@ -23,7 +23,7 @@ QUARTERS = {"0": 0.0, "π/2": math.pi / 2, "π": math.pi, "3π/2": 1.5 * math.pi
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Episodes with the directions they were told to take.
+    """Trajectories of episodes, with their target directions.
 
     Attributes:
         directions: Target directions in radians, counted from +x towards +y, ``(N,)``.
@@ -37,7 +37,7 @@ class Trajectories:
 def play_directions(
     policy: TensorDictModuleBase, env: CharacterEnv, directions: Tensor, *, deterministic: bool = True
 ) -> Trajectories:
-    """Play one episode per direction, whatever directions the environment draws by itself.
+    """Play one episode per direction, in place of the directions that the environment draws.
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``.
@@ -64,15 +64,15 @@ def save_trajectories(trajectories: Trajectories, path: Path) -> None:
 
 
 def load_trajectories(path: Path) -> Trajectories:
-    """Read what :func:`save_trajectories` wrote."""
+    """Read a file of :func:`save_trajectories`."""
     with np.load(path) as archive:
         return Trajectories(archive["directions"], archive["positions"])
 
 
 def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
-    """Draw trajectories, each panel under its title, all on one scale in metres.
+    """Draw trajectories, one panel per title, on a common scale in metres.
 
-    A path has the colour of its target direction, which the mark of that colour on the outer ring shows: perfect paths
+    A path has the colour of its target direction, which a mark of that colour on the outer ring shows: perfect paths
     are rays towards their marks.
     """
     rings = _rings(max(_greatest_distance(panel) for panel in panels.values()))
@@ -92,13 +92,13 @@ def _greatest_distance(trajectories: Trajectories) -> float:
 
 
 def _rings(reach: float) -> Sequence[float]:
-    """Return round distances in metres, equally spaced, the last of which is at least ``reach``."""
+    """Return round, equally spaced distances in metres, up to at least ``reach``."""
     ticks = MaxNLocator(nbins=3, steps=[1, 2, 4, 5, 10]).tick_values(0.0, max(reach, 1e-3))
     return [float(tick) for tick in ticks if tick > 0]
 
 
 def _draw_compass(axes: Axes, rings: Sequence[float]) -> None:
-    """Draw rings of equal distance, and name the quarters around the outermost."""
+    """Draw rings of equal distance, and label the quarters around the outermost."""
     angle = np.linspace(0.0, 2 * math.pi, 361)
     for radius in rings:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=FAINT, linewidth=0.8, zorder=0)

@@ -1,4 +1,4 @@
-r"""Specialisation in numbers, beside Figure 7: how weights follow the walk cycle, how far actions are apart.
+r"""Measures of specialisation for Figure 7: dependence of weights on the walk cycle, and separation of actions.
 
 Samples are rows; ``K`` counts primitives, ``A`` actions, ``M`` samples.
 """
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PHASE_BINS = 20
-"""Of a stride."""
+"""Number of bins of a stride."""
 
 
 def bin_means(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> Array:
-    """Return the mean in each of ``num_bins`` equal bins of the phase, ``(num_bins, K)``; NaN where there is none.
+    """Return the mean in each of ``num_bins`` equal bins of the phase, ``(num_bins, K)``; NaN in empty bins.
 
     Args:
-        values: Shape ``(M, K)``.
-        phases: In [0, 1), shape ``(M,)``.
+        values: Values, shape ``(M, K)``.
+        phases: Phases in [0, 1), shape ``(M,)``.
         num_bins: Number of bins.
     """
     bins = (phases * num_bins).astype(int)
@@ -27,18 +27,17 @@ def bin_means(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> Array
 
 
 def explained_by_phase(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> tuple[Array, float]:
-    r"""Return the share of variance that the phase explains, whatever the shape of the dependence.
+    r"""Return the share of variance that the phase explains, for a dependence of any shape.
 
     .. math:: \eta^2_k = \frac{\mathrm{Var}\left[\mathrm{E}[w_k | \phi]\right]}{\mathrm{Var}[w_k]}
 
     Args:
         values: Weights w, shape ``(M, K)``.
-        phases: In [0, 1), shape ``(M,)``.
-        num_bins: Bins within which the mean counts as constant.
+        phases: Phases in [0, 1), shape ``(M,)``.
+        num_bins: Number of bins, within which the mean is taken as constant.
 
     Returns:
-        Of each column, ``(K,)``, 0 where it does not vary; and of all together, in which a column counts by its
-        variance.
+        The share of each column, ``(K,)``, 0 for constant columns, and the share of all columns together.
     """
     deviation = values - values.mean(0)
     predicted = bin_means(deviation, phases, num_bins)[(phases * num_bins).astype(int)]
@@ -54,7 +53,7 @@ def circular_correlation(values: Array, phases: Array) -> Array:
 
     Args:
         values: Weights w, shape ``(M, K)``.
-        phases: In [0, 1), shape ``(M,)``.
+        phases: Phases in [0, 1), shape ``(M,)``.
 
     Reference:
         Mardia, Linear-circular correlation coefficients and rhythmometry, 1976, https://doi.org/10.1093/biomet/63.2.403
@@ -68,7 +67,8 @@ def circular_correlation(values: Array, phases: Array) -> Array:
 def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
     """Return the correlation of each column with left minus right foot on the ground, ``(K,)``.
 
-    1 is a weight that is high where the left foot alone stands and low where the right one does, -1 the opposite.
+    It is 1 for a weight that is high when only the left foot stands and low when only the right one does, and -1 for
+    the opposite.
 
     Args:
         values: Weights, shape ``(M, K)``.
@@ -81,11 +81,11 @@ def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
 
 
 def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
-    """Return the actions in the directions in which they vary most, ``(M, num)``, and their shares of the variance.
+    """Return the principal components of actions, ``(M, num)``, and their shares of the variance.
 
     Args:
-        actions: Shape ``(M, A)``.
-        num: Number of directions.
+        actions: Actions, shape ``(M, A)``.
+        num: Number of components.
     """
     centred = actions - actions.mean(0)
     _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
@@ -93,7 +93,7 @@ def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
 
 
 def between_primitives(actions: Array) -> float:
-    """Return the share of the variance of actions that lies between the primitives' own means.
+    """Return the share of the variance of actions that lies between the means of the primitives.
 
     Args:
         actions: Mean action of every primitive in the same states, shape ``(M, K, A)``.
@@ -103,12 +103,12 @@ def between_primitives(actions: Array) -> float:
 
 
 def silhouettes(actions: Array) -> Array:
-    r"""Return how much closer actions are to those of their own primitive than of the nearest other one, ``(K,)``.
+    r"""Return the mean silhouette of each primitive's actions, ``(K,)``.
 
     .. math:: s = \frac{b - a}{\max(a, b)}
 
-    with a the mean distance of an action from the others of its primitive and b that from the actions of the nearest
-    other one; means over the actions of each primitive. 1 is well apart, 0 on the border, below 0 among others.
+    with a the mean distance of an action from the other actions of its primitive, and b its mean distance from the
+    actions of the nearest other primitive. 1 is well separated, 0 on the border, negative among other actions.
 
     Args:
         actions: Mean action of every primitive in the same states, shape ``(M, K, A)``, M at least 2.
@@ -130,5 +130,5 @@ def silhouettes(actions: Array) -> Array:
 
 
 def _ratio(numerator: Array, denominator: Array) -> Array:
-    """Return quotients, 0 where the denominator is."""
+    """Return quotients, 0 where the denominator is 0."""
     return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0)

@@ -12,16 +12,16 @@ from torchrl_mcp.analysis.specialisation import PHASE_BINS, stance_correlation
 from torchrl_mcp.analysis.walks import STATES, Walk, cycle_rows, plane, specialisation
 
 SHADE = "#EEEEEE"
-"""Where the right foot stands alone."""
+"""Colour of phases in which only the right foot stands."""
 
 
 def draw_walk_cycle(walk: Walk, untrained: Mapping[str, float], *, title: str) -> Figure:
-    """Draw weights over the walk cycle beside mean actions in the plane in which they vary most.
+    """Draw weights over the walk cycle, and mean actions in the plane of their first two principal components.
 
     Args:
-        walk: What to draw.
-        untrained: :func:`specialisation` of networks before training.
-        title: Says whose they are.
+        walk: The walk to draw.
+        untrained: :func:`specialisation` of untrained networks.
+        title: Title of the figure.
     """
     rows = -(-walk.gates.shape[-1] // 2)
     figure = new_figure(9.2, 2.0 + 0.7 * max(rows, 4))
@@ -88,7 +88,7 @@ def _draw_feet(axes: Axes, cells: Sequence[Mapping[str, float]]) -> None:
 
 
 def _spans(rows: Sequence[Mapping[str, float]]) -> list[tuple[float, float]]:
-    """Beginning and width of the bins of some rows."""
+    """Start and width of the bins of some rows."""
     return [(row["phase"] - 0.5 / PHASE_BINS, 1 / PHASE_BINS) for row in rows]
 
 
@@ -98,7 +98,7 @@ def _draw_actions(figure: SubFigure, walk: Walk) -> None:
     for number, colour in enumerate(colours(scores.shape[1]), start=1):
         points = scores[:, number - 1]
         axes.scatter(points[:, 0], points[:, 1], s=6, color=colour, linewidths=0)
-        # At the edge of the cloud that is away from the others: the origin is the mean of all.
+        # At the outer edge of the cloud: the origin is the mean of all clouds.
         outwards = points.mean(0) / np.linalg.norm(points.mean(0))
         axes.annotate(
             str(number),

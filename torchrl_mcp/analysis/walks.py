@@ -26,10 +26,10 @@ from torchrl_mcp.methods.actor import PRIMITIVES
 Array = NDArray[np.float64]
 
 STATES = 100
-"""Of which actions are drawn and compared: evenly spread over the walk."""
+"""Number of states, evenly spread over the walk, whose actions are drawn and compared."""
 
 GOLDEN = 0.6180339887498949
-"""Fractional part of the golden ratio: its multiples spread evenly over a cycle, however many there are."""
+"""Fractional part of the golden ratio: any number of its multiples spreads evenly over a cycle."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Walk:
     """The samples of a policy in the complete strides of a walk.
 
     Attributes:
-        phases: Of the stride, 0 where the right foot touches down, in [0, 1), ``(M,)``.
+        phases: Phases of the stride in [0, 1), 0 when the right foot touches down, ``(M,)``.
         standing: Whether the right and the left foot stand, ``(M, 2)``.
         gates: Weights of the primitives, ``(M, K)``.
         actions: Mean actions of the primitives, ``(M, K, A)``.
-        inputs: What the policy saw, ``observation`` and ``goal``, batch size ``(M,)``.
+        inputs: Inputs of the policy, ``observation`` and ``goal``, batch size ``(M,)``.
         strides: Number of strides.
         seconds: Mean duration of a stride.
     """
@@ -56,9 +56,9 @@ class Walk:
 
 
 def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float = 10.0) -> Walk:
-    """Let characters follow the first reference motion from moments spread over it, and keep their complete strides.
+    """Record the complete strides of characters that follow the first reference motion from moments spread over it.
 
-    A character counts until it falls or loses its reference.
+    Samples count until a character falls or loses its reference.
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``, ``gates`` and ``primitives``; it plays its
@@ -90,15 +90,15 @@ def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float 
 
 
 def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
-    """Find the strides of walkers and put what belongs to them in a row.
+    """Find the complete strides of walkers, and concatenate their samples.
 
     Args:
-        steps: ``observation``, ``goal``, ``gates``, ``primitives``, ``standing`` and whether that still counts,
-            ``running``, of N walkers, batch size ``(N, T)``.
+        steps: ``observation``, ``goal``, ``gates``, ``primitives``, ``standing`` and ``running``, whether the sample
+            counts, of N walkers, batch size ``(N, T)``.
         timestep: Seconds per step.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no complete stride.
     """
     walkers = [walker[walker["running"]] for walker in steps.unbind(0)]
     phases = [stride_phases(walker["standing"].numpy()) for walker in walkers]
@@ -122,7 +122,7 @@ def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
 
 
 def specialisation(walk: Walk) -> dict[str, float]:
-    """Return how far a policy's primitives specialise.
+    """Return measures of the specialisation of a policy's primitives.
 
     ``phase`` is the share of the variance of all weights that the phase of the stride explains, ``swing`` the mean
     difference between the greatest and the least weight of a primitive over the cycle, ``left`` and ``right`` the
@@ -163,9 +163,9 @@ def primitive_rows(walk: Walk) -> list[dict[str, float]]:
 
 
 def cycle_rows(walk: Walk) -> list[dict[str, float]]:
-    """Return for every bin of the cycle the shares of time in which feet stand, and the weights of the primitives.
+    """Return, for every bin of the cycle, the shares of time for which feet stand, and the weights of the primitives.
 
-    ``low`` and ``high`` hold nine tenths of the samples between them.
+    Nine tenths of the samples lie between ``low`` and ``high``.
     """
     bins = (walk.phases * PHASE_BINS).astype(int)
     feet = bin_means(walk.standing.astype(float), walk.phases)
@@ -189,7 +189,7 @@ def cycle_rows(walk: Walk) -> list[dict[str, float]]:
 
 
 def action_rows(walk: Walk) -> list[dict[str, float]]:
-    """Return the mean actions of all primitives, in the same states, in the plane of their principal components."""
+    """Return the mean actions of all primitives in the same states, as principal components."""
     scores, _ = plane(walk)
     return [
         {"state": state, "primitive": number, "component_1": float(one), "component_2": float(two)}
@@ -199,9 +199,9 @@ def action_rows(walk: Walk) -> list[dict[str, float]]:
 
 
 def plane(walk: Walk) -> tuple[Array, Array]:
-    """Return mean actions in their first two principal components, ``(STATES, K, 2)``, and their shares, ``(2,)``.
+    """Return the first two principal components of mean actions, ``(STATES, K, 2)``, and their shares, ``(2,)``.
 
-    A share is one of the variance of the mean actions of all primitives.
+    The shares are of the variance of the mean actions of all primitives.
     """
     actions = _few(walk.actions)
     scores, shares = principal_components(actions.reshape(-1, actions.shape[-1]))

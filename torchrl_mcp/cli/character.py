@@ -1,4 +1,4 @@
-"""``torchrl-mcp-character``: check whether an MJCF file is a character, and make one of a body for something else."""
+"""``torchrl-mcp-character``: check whether an MJCF file is a character, or convert a body into a character."""
 
 import argparse
 import re
@@ -11,13 +11,13 @@ PROGRAM = "torchrl-mcp-character"
 
 EXAMPLES = f"""\
 examples:
-  {PROGRAM} check robot.xml                # each violation of what tasks expect, with its remedy
+  {PROGRAM} check robot.xml                # every violation of the contract, with its remedy
   {PROGRAM} adapt robot.xml --name robot2  # writes robot2.xml, robot2.py and own/character/robot2.yaml
 """
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command."""
     arguments = parser().parse_args()
     if not arguments.file.is_file():
         sys.exit(f"{PROGRAM}: there is no file {arguments.file}")
@@ -44,8 +44,8 @@ def parser() -> argparse.ArgumentParser:
         "check", parents=[shared], help="list violations; the exit status is 1 if there are any"
     )
     command.set_defaults(run="check")
-    command = commands.add_parser("adapt", parents=[shared], help="strip and convert what can be")
-    command.add_argument("--name", type=_name, required=True, help="of the character, and of its files")
+    command = commands.add_parser("adapt", parents=[shared], help="remove and convert parts to make a character")
+    command.add_argument("--name", type=_name, required=True, help="name of the character and of its files")
     command.add_argument("--output", type=Path, default=Path(), help="folder to write to (default here)")
     command.set_defaults(run="adapt")
     return parser

@@ -1,4 +1,4 @@
-"""``torchrl-mcp-demo``: pre-train primitives, transfer them to directions never seen, and compare with scratch."""
+"""``torchrl-mcp-demo``: pre-train primitives, transfer them to unseen directions, and compare with scratch."""
 
 import argparse
 import sys
@@ -10,7 +10,7 @@ PROGRAM = "torchrl-mcp-demo"
 
 
 def main() -> None:
-    """Run the demonstration, or what is left of it."""
+    """Run or continue the demonstration."""
     arguments = parser().parse_args()
     announce(PROGRAM)
     from hydra.errors import HydraException
@@ -23,7 +23,7 @@ def main() -> None:
     except (HydraException, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
-        sys.exit(f"\n{PROGRAM}: interrupted; call it again to go on from here")
+        sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -33,10 +33,10 @@ def parser() -> argparse.ArgumentParser:
         "overrides",
         nargs="*",
         metavar="SETTING=VALUE",
-        help="settings of all runs, as torchrl-mcp-train takes them: seed=1",
+        help="settings of all runs, as for torchrl-mcp-train: seed=1",
     )
     parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
-    parser.add_argument("--smoke", action="store_true", help="a test of the demonstration, which takes seconds")
+    parser.add_argument("--smoke", action="store_true", help="only test that the demonstration runs, in seconds")
     return parser
 
 

@@ -1,7 +1,7 @@
-"""The demonstration: pre-train primitives, transfer them to directions never seen, and compare with scratch.
+"""The demonstration: pre-train primitives, transfer them to unseen directions, and compare with scratch.
 
-Two processes work side by side, one for MCP and one for scratch, which gets as many steps as MCP's pre-training and
-transfer together. Everything lands in one folder, and what is there already is not done again.
+Two processes run in parallel, one for MCP and one for scratch, which gets as many steps as MCP's pre-training and
+transfer together. All results are written to one folder, and results that are already there are reused.
 """
 
 import json
@@ -20,6 +20,7 @@ from torchrl_mcp import __version__, analysis
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.identity import PLACES, differences
+from torchrl_mcp.runs.policies import evaluate_run, restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.bar import TrainingBar
@@ -35,7 +36,7 @@ RUNS = {
     "scratch": ["method=scratch", "stage=transfer"],
 }
 
-# Panels of the picture: title, run, and stage whose directions the ant is told to take.
+# Panels of the picture: title, run, and stage whose directions are the ant's targets.
 PANELS = {
     "seen": ("pre-training directions,\nas pre-trained", "pretrain", "pretrain"),
     "before": ("held-out directions,\nas pre-trained", "pretrain", "transfer"),
@@ -56,10 +57,10 @@ class Policy:
     """A policy in the table of results.
 
     Attributes:
-        label: What the table calls it.
+        label: Name in the table.
         path: Run folder or checkpoint file.
         steps: Environment steps of training on the held-out directions.
-        pretraining_steps: Environment steps of training on others before.
+        pretraining_steps: Environment steps of pre-training on the other directions.
     """
 
     label: str
@@ -69,10 +70,10 @@ class Policy:
 
 
 def run(folder: Path, overrides: Sequence[str]) -> None:
-    """Train, evaluate and report in ``folder``, save what it holds already.
+    """Train, evaluate and report in ``folder``, except for results that it already has.
 
     Raises:
-        ValueError: If the settings contradict each other or those of the folder, or a process fails.
+        ValueError: If the settings contradict each other or the folder's, or a process fails.
     """
     began = time.monotonic()
     runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
@@ -80,7 +81,7 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     require_early_checkpoint(runs)
     settings = runs["pretrain"].demo
     print(f"This takes about {settings.minutes} minutes on two cores. Everything lands in {folder}.")
-    print("Interrupt it when you like: called again, it goes on from there.", flush=True)
+    print("You may interrupt it: repeat the command to continue.", flush=True)
     show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
     print("\n" + report(folder, runs))
     filmed = film(folder, settings.film.seconds)
@@ -89,9 +90,9 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
 
 
 def film(folder: Path, seconds: float) -> str:
-    """Film the ant after transfer, unless there is a film, and return what the contents say of it."""
+    """Film the ant after transfer, unless there is a film, and return its line in the list of contents."""
     path = folder / FILM
-    _, agent, env = experiment.restore(folder / "transfer", num_envs=1, seed=0)
+    _, agent, env = restore(folder / "transfer", num_envs=1, seed=0)
     try:
         if not path.exists():
             save_film(agent.actor.policy, env, path, seconds=seconds)
@@ -104,7 +105,7 @@ def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
     Raises:
-        ValueError: If the folder holds a run with another one.
+        ValueError: If the folder holds a run with another configuration.
     """
     cfg = build.compose_run(*overrides)
     cfg.run_dir = str(folder)
@@ -142,7 +143,7 @@ def policies(folder: Path, runs: Runs) -> dict[str, Policy]:
 
 
 def learn_and_transfer(folder: Path, runs: Runs) -> None:
-    """Pre-train MCP, transfer it, evaluate it before and after, and record where it goes."""
+    """Pre-train MCP, transfer it, evaluate it before and after, and record its trajectories."""
     experiment.train_or_resume(runs["pretrain"])
     experiment.train_or_resume(runs["transfer"])
     for name in ("before", "after"):
@@ -164,12 +165,12 @@ def evaluate(folder: Path, runs: Runs, name: str) -> None:
     if file.exists():
         return
     path, directions = policies(folder, runs)[name].path, cfg.task.directions.transfer
-    results = experiment.evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
+    results = evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
     write_json(results, file)
 
 
 def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
-    """Play the episodes of one of the ``PANELS``."""
+    """Record the trajectories of one of the ``PANELS``."""
     file, (_, run_name, stage) = trajectory_file(folder, name), PANELS[name]
     if file.exists():
         return
@@ -177,7 +178,7 @@ def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
     low, high = cfg.task.directions[stage]
     grid = torch.linspace(low, high, round((high - low) / SPACING) + 1)
     directions = grid.repeat_interleave(cfg.demo.paths.per_direction)
-    _, agent, env = experiment.restore(
+    _, agent, env = restore(
         Path(cfg.run_dir), num_envs=len(directions), seed=cfg.demo.seed, max_episode_steps=cfg.demo.paths.steps
     )
     with replacing(file) as partial:
@@ -185,7 +186,7 @@ def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
 
 
 def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
-    """Show how far training is, and then evaluation, until both are done."""
+    """Show the progress of training, then of evaluation, until both are done."""
     files = [evaluation_file(folder, name) for name in policies(folder, runs)]
     files += [trajectory_file(folder, name) for name in PANELS]
     total, done = sum(map(_steps, runs.values())), _steps_taken(folder, runs)
@@ -229,12 +230,12 @@ def report(folder: Path, runs: Runs) -> str:
 
 
 def evaluation_file(folder: Path, name: str) -> Path:
-    """Return where the evaluation of one of the :func:`policies` is kept."""
+    """Return the file of the evaluation of one of the :func:`policies`."""
     return folder / "evaluation" / f"{name}.json"
 
 
 def trajectory_file(folder: Path, name: str) -> Path:
-    """Return where the episodes of one of the ``PANELS`` are kept."""
+    """Return the file of the trajectories of one of the ``PANELS``."""
     return folder / "trajectories" / f"{name}.npz"
 
 
@@ -258,5 +259,5 @@ def _steps_taken(folder: Path, runs: Runs) -> int:
 
 
 def _steps(cfg: DictConfig) -> int:
-    """Environment steps of a run, which ends with a whole batch."""
+    """Environment steps of a run, rounded up to whole batches."""
     return math.ceil(cfg.training.total_frames / cfg.training.frames_per_batch) * cfg.training.frames_per_batch

@@ -1,6 +1,6 @@
 """``torchrl-mcp-evaluate``: returns and diagnostics of a trained policy.
 
-With ``--output RUN/evaluation.json`` it leaves in a run folder what training ends with.
+With ``--output RUN/evaluation.json`` it writes the file that training writes at its end.
 """
 
 import argparse
@@ -23,7 +23,7 @@ def main() -> None:
     try:
         path = locate(arguments.checkpoint)
         announce(PROGRAM)
-        from torchrl_mcp.runs.experiment import evaluate_clips, evaluation
+        from torchrl_mcp.runs.policies import evaluate_clips, evaluation
         from torchrl_mcp.runs.trust import trusting
 
         with trusting(arguments.trust):
@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[dict[str, Any]]) -> None:
-    """Print the statistics, and write them to a file if wanted."""
+    """Print the statistics, and write them to a file if requested."""
     from torchrl_mcp.evaluation.diagnostics import COLLAPSED
     from torchrl_mcp.runs.tables import text_table
 
@@ -70,13 +70,12 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, "Play episodes with a trained policy: returns, and diagnostics of gates and options.")
     parser.add_argument(
         "checkpoint",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
-        "builtin:CHARACTER-TASK",
+        help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
     )
     parser.add_argument("--episodes", type=int, default=128, help="episodes, one per environment (default 128)")
     parser.add_argument("--seed", type=int, default=12345, help="seed of environments and sampling (default 12345)")
     parser.add_argument(
-        "--clips", type=int, metavar="N", help="of imitation: follow every reference motion alone, in N episodes each"
+        "--clips", type=int, metavar="N", help="imitation only: follow each reference motion alone, in N episodes"
     )
     add_trust(parser)
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")

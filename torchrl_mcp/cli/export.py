@@ -10,7 +10,7 @@ from torchrl_mcp.runs.builtin import locate
 PROGRAM = "torchrl-mcp-export"
 
 EXAMPLES = f"""\
-The program takes observation and goal, as the environment gives them, and returns the deterministic action.
+The program takes the environment's observation and goal, and returns the deterministic action.
 
 examples:
   {PROGRAM} builtin:humanoid --onnx humanoid.onnx   # needs pip install 'torchrl-mcp[onnx]'
@@ -19,7 +19,7 @@ examples:
 
 
 def main() -> None:
-    """Write the policy, and say how well the program agrees with it."""
+    """Write the policy, and print its difference from torch."""
     options = parser()
     arguments = options.parse_args()
     if arguments.onnx is None and arguments.torch is None:
@@ -49,8 +49,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "checkpoint",
         metavar="CHECKPOINT",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
-        "builtin:CHARACTER-TASK",
+        help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
     )
     add_trust(parser)
     parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")

@@ -10,8 +10,8 @@ from torchrl_mcp.runs.builtin import PREFIX, locate
 PROGRAM = "torchrl-mcp-figures"
 
 EXAMPLES = f"""\
-A CHECKPOINT is a run folder, of which the newest checkpoint counts, a checkpoint file, or {PREFIX}CHARACTER, the
-networks that come with the library.
+A CHECKPOINT is a run folder (its newest checkpoint), a checkpoint file, or {PREFIX}CHARACTER, a network that comes with
+the library.
 
 examples:
   {PROGRAM} holdout runs/holdout/*                              # Figure 5
@@ -21,7 +21,7 @@ examples:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command."""
     arguments = parser().parse_args()
     try:
         arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
@@ -41,21 +41,23 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, description, EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT")
+    shared.add_argument(
+        "checkpoints", nargs="+", metavar="CHECKPOINT", help="run folder, checkpoint file or builtin:CHARACTER"
+    )
     shared.add_argument("--output", type=Path, default=Path("figures"), help="folder (default figures)")
     add_trust(shared)
-    shared.add_argument("--seed", type=int, default=0, help="of environments and of what is random (default 0)")
+    shared.add_argument("--seed", type=int, default=0, help="seed of environments and random numbers (default 0)")
 
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")
     command.set_defaults(draw="holdout")
-    command = commands.add_parser("exploration", parents=[shared], help="Figure 6: where random combinations lead")
-    command.add_argument("--trajectories", type=int, default=48, metavar="N", help="of each method (default 48)")
-    command.add_argument("--seconds", type=float, default=10.0, help="of each at most (default 10)")
+    command = commands.add_parser("exploration", parents=[shared], help="Figure 6: paths of random exploration")
+    command.add_argument("--trajectories", type=int, default=48, metavar="N", help="number per method (default 48)")
+    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of each (default 10)")
     command.set_defaults(draw="explore")
     command = commands.add_parser("primitives", parents=[shared], help="Figure 7: weights over the walk cycle, actions")
     command.add_argument("--clip", help="generated motion to follow, such as left_sharp (default straight ahead)")
-    command.add_argument("--walkers", type=int, default=8, metavar="N", help="side by side (default 8)")
-    command.add_argument("--seconds", type=float, default=10.0, help="of each (default 10)")
+    command.add_argument("--walkers", type=int, default=8, metavar="N", help="number of simulations (default 8)")
+    command.add_argument("--seconds", type=float, default=10.0, help="length of each walk (default 10)")
     command.set_defaults(draw="analyse")
     return parser
 

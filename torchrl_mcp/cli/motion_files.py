@@ -1,4 +1,4 @@
-"""Motion files: imported, inspected, drawn, and the paper's corpus."""
+"""Importing, inspecting and drawing motion files, and rebuilding the paper's corpus."""
 
 import argparse
 import math
@@ -23,7 +23,7 @@ PAPER_CORPUS = {
     "0005_Walking001.bvh": 39.09,
     "humanoid3d_walk.txt": 1.27,
 }
-"""Seconds of each file. With mirror images of all but the last, which loops, they make the 230 s of appendix C."""
+"""Seconds of each file. With mirror images of all but the last, which loops, they add up to appendix C's 230 s."""
 
 SOURCES = {
     ".txt": "https://github.com/xbpeng/DeepMimic, data/motions",
@@ -44,7 +44,7 @@ COLUMNS = (
     "torque/limit",
     "rest pose leans",
 )
-"""Of the table, from ``summary`` and ``feasibility`` of ``torchrl_mcp.envs.motions.inspection``."""
+"""Columns of the table, from ``summary`` and ``feasibility`` of ``torchrl_mcp.envs.motions.inspection``."""
 
 STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
     "length m": lambda strides: strides.stride_length,
@@ -58,14 +58,14 @@ STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
     "foot strikes deg": lambda strides: strides.pitch_strike,
     "arm swing deg": lambda strides: strides.arm_swing,
 }
-"""Columns of the table of strides, whose medians it shows."""
+"""Columns of the table of strides, which shows medians."""
 
 SLIDING = 0.2
-"""m/s. The feet of a motion that is read correctly slide less, those of one that is not more."""
+"""Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
 
 
 def import_files(arguments: argparse.Namespace) -> None:
-    """Write a clip for each file, and one of its mirror image if wanted."""
+    """Write a clip for each file, and its mirror image if requested."""
     motions = _load(arguments)
     if arguments.mirror:
         motions |= {
@@ -75,7 +75,7 @@ def import_files(arguments: argparse.Namespace) -> None:
 
 
 def inspect_files(arguments: argparse.Namespace) -> None:
-    """Say what motions are like."""
+    """Print tables about motions."""
     motions = _load(arguments)
     print(_table(motions))
     if arguments.strides:
@@ -135,7 +135,7 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
 
 
 def _save(motions: Mapping[str, Import], folder: Path) -> None:
-    """Write clips into a folder, and say what they are like."""
+    """Write clips into a folder, and print a table about them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, (clip, _) in motions.items():
         clip.save(folder / f"{name}.npz")
@@ -143,7 +143,7 @@ def _save(motions: Mapping[str, Import], folder: Path) -> None:
 
 
 def _table(motions: Mapping[str, Import]) -> str:
-    """Return a line for each clip, and warn of those whose feet slide."""
+    """Return a line for each clip, with a warning about clips whose feet slide."""
     summaries = {name: summarised(motion.clip) for name, motion in motions.items()}
     rows = [_row(name, *motion, summaries[name]) for name, motion in motions.items()]
     total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
@@ -173,7 +173,7 @@ def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tup
 
 
 def _strides(motions: Mapping[str, Import]) -> str:
-    """Return a line of medians over the whole strides of each clip of a human body."""
+    """Return a line of medians over the complete strides of each clip of a human body."""
     rows = []
     for name, (clip, _) in motions.items():
         if clip.character in HUMANS:
@@ -188,7 +188,7 @@ def _strides(motions: Mapping[str, Import]) -> str:
 
 
 def _joint_map(pairs: list[str]) -> dict[str, str] | None:
-    """Read ``PART=JOINT``."""
+    """Parse ``PART=JOINT``."""
     if wrong := [pair for pair in pairs if "=" not in pair]:
         raise ValueError(f"--map {wrong[0]} is not of the form PART=JOINT, such as left_knee=LKnee")
     return {part.strip(): joint.strip() for part, _, joint in (pair.partition("=") for pair in pairs)} or None

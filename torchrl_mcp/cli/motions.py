@@ -1,4 +1,4 @@
-"""``torchrl-mcp-motions``: import motion capture, look at it, and rebuild the paper's corpus."""
+"""``torchrl-mcp-motions``: import and inspect motion capture, and rebuild the paper's corpus."""
 
 import argparse
 import sys
@@ -25,7 +25,7 @@ examples:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command."""
     arguments = parser().parse_args()
     try:
         require_files(arguments)
@@ -38,10 +38,10 @@ def main() -> None:
 
 
 def require_files(arguments: argparse.Namespace) -> None:
-    """Check that the files of the command line are there.
+    """Check that the files on the command line exist.
 
     Raises:
-        FileNotFoundError: If one is not.
+        FileNotFoundError: If one does not.
     """
     for path in getattr(arguments, "files", []):
         if not path.exists():
@@ -53,35 +53,37 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, "Import motion capture, look at it, and rebuild the paper's corpus.", EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
-    target.add_argument("--character", choices=HUMANS, default="humanoid", help="who moves (default humanoid)")
+    target.add_argument(
+        "--character", choices=HUMANS, default="humanoid", help="character of the clips (default humanoid)"
+    )
     target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
-    source.add_argument("--fps", type=float, help="frames per second of the files, if not what they state (.amc: 120)")
-    source.add_argument("--scale", type=float, help="metres per unit of length; found by the length of the legs")
+    source.add_argument("--fps", type=float, help="frames per second of the files, in place of their own (.amc: 120)")
+    source.add_argument("--scale", type=float, help="metres per unit of length (default: fits the length of the legs)")
     source.add_argument(
-        "--map", action="append", default=[], metavar="PART=JOINT", help="which joint is a part of the body; repeatable"
+        "--map", action="append", default=[], metavar="PART=JOINT", help="joint of a part of the body; repeatable"
     )
     source.add_argument(
         "--skip", type=int, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
     )
     source.add_argument(
-        "--rest-frame", type=int, metavar="N", help="frame, from 0, that stands, if the rest pose does not"
+        "--rest-frame", type=int, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
     )
-    source.add_argument("--asf", type=Path, help="skeleton of .amc files, if it is not beside them")
+    source.add_argument("--asf", type=Path, help="skeleton of .amc files, if not in their folder")
 
     command = commands.add_parser("import", parents=[source, target], help="write clips (.npz)")
     command.add_argument("--mirror", action="store_true", help="write mirror images as well")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="import_files")
     command = commands.add_parser("inspect", parents=[source, target], help="duration, speed, turn rate, slide, limits")
-    command.add_argument("--strides", action="store_true", help="length, cadence, width and more of human strides, too")
+    command.add_argument("--strides", action="store_true", help="add length, cadence, width and more of human strides")
     command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
-    command.add_argument("--seconds", type=float, default=10.0, help="length of the film at most (default 10)")
+    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of the film (default 10)")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="render_files")
     command = commands.add_parser("build-paper-corpus", parents=[target], help="230 s of walking, from your downloads")
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="where the downloaded files are")
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the downloaded files")
     command.add_argument("--output", type=Path, default=Path("corpus"), help="folder for the clips (default corpus)")
     command.set_defaults(run="build_paper_corpus")
     return parser

@@ -1,4 +1,4 @@
-"""Files of characters: checked, and written for bodies that were made for something else."""
+"""Checking files of characters, and converting other bodies into characters."""
 
 import argparse
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ action_std: 0.1 # of the action before training, where 1 is half the range of a 
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Print each violation of the contract; return how the program ends."""
+    """Print each violation of the contract; return the exit status."""
     model = _read(arguments.file)
     found = violations(model, feet=_feet(model, arguments.feet))
     print(*(f"- {violation}" for violation in found), sep="\n", end="\n" if found else "")
@@ -44,7 +44,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def adapt(arguments: argparse.Namespace) -> int:
-    """Write a character that is made of a file, its module and its configuration."""
+    """Convert a file into a character, and write it with its module and its configuration."""
     name, folder = arguments.name, arguments.output
     spec = adapted(_read(arguments.file))
     spec.modelname = name
@@ -73,7 +73,7 @@ def _read(path: Path) -> mujoco.MjModel:
     """Compile an MJCF file.
 
     Raises:
-        ValueError: If MuJoCo does not take it.
+        ValueError: If MuJoCo cannot read it.
     """
     try:
         return mujoco.MjModel.from_xml_path(str(path))

@@ -19,7 +19,7 @@ from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories
 from torchrl_mcp.analysis.walk_cycle import draw_walk_cycle
 from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, specialisation
 from torchrl_mcp.report.paper import CHARACTERS
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.tables import text_table
 
 PAPER = """\
@@ -32,9 +32,9 @@ def holdout(arguments: argparse.Namespace) -> None:
     """Draw Figure 5: learning curves on the held-out directions, and trajectories by target direction."""
     runs: dict[str, dict[str, list[Path]]] = {}
     for path in arguments.checkpoints:
-        cfg = experiment.policy_config(path)
+        cfg = policies.policy_config(path)
         if cfg.task.name != "holdout":
-            raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that")
+            raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that task")
         runs.setdefault(_label(cfg), {}).setdefault(cfg.stage.name, []).append(path)
     for label, stages in runs.items():
         panels: dict[str, Trajectories] = {}
@@ -50,7 +50,7 @@ def holdout(arguments: argparse.Namespace) -> None:
 
 
 def explore(arguments: argparse.Namespace) -> None:
-    """Draw Figure 6: where a character goes that explores at random, by method."""
+    """Draw Figure 6: paths of random exploration, by method."""
     panels, character = _explored(arguments)
     stem = arguments.output / f"exploration_{character}"
     title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
@@ -62,8 +62,8 @@ def explore(arguments: argparse.Namespace) -> None:
 
 
 def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], str]:
-    """Exploration by its name, that of every checkpoint and that of noise, and the character that explored."""
-    runs = [(name, *experiment.restore(path, num_envs=1, seed=0)[:2]) for name, path in _named(arguments.checkpoints)]
+    """Explorations by name, of every checkpoint and of noise, and the name of the character."""
+    runs = [(name, *policies.restore(path, num_envs=1, seed=0)[:2]) for name, path in _named(arguments.checkpoints)]
     first = runs[0][1]
     if others := {cfg.character.name for _, cfg, _ in runs} - {first.character.name}:
         given = f"{first.character.name} and {', '.join(others)}"
@@ -83,10 +83,10 @@ def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], st
 
 
 def analyse(arguments: argparse.Namespace) -> None:
-    """Draw Figure 7: weights over the walk cycle and mean actions of primitives, and say how far they specialise."""
+    """Draw Figure 7: weights over the walk cycle and mean actions of primitives; print their specialisation."""
     rows = []
     for name, path in _named(arguments.checkpoints):
-        cfg = experiment.policy_config(path)
+        cfg = policies.policy_config(path)
         walk, untrained = checkpoints.walk_of(
             path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
         )
@@ -122,7 +122,7 @@ def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
 
 
 def _label(cfg: DictConfig) -> str:
-    """Title of a method, with its mixer and exploration if they are not its standard."""
+    """Title of a method, with its mixer and exploration if they are not standard."""
     details = []
     if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
         details.append(cfg.mixer.name)
@@ -132,7 +132,7 @@ def _label(cfg: DictConfig) -> str:
 
 
 def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Paths with names for files: as much of their ends as tells them apart."""
+    """Paths with names for files: the shortest ends of the paths that are unique."""
     whole = [path.resolve().with_suffix("") if path.is_file() else path.resolve() for path in paths]
     for depth in range(1, max(len(path.parts) for path in whole) + 1):
         names = ["-".join(path.parts[-depth:]) for path in whole]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torchrl_mcp.cli.parsing import add_trust, announce, find_own_modules, new_parser
 from torchrl_mcp.runs.builtin import locate
+from torchrl_mcp.viewer.formats import require_format
 
 PROGRAM = "torchrl-mcp-play"
 
@@ -14,20 +15,22 @@ examples:
   {PROGRAM} builtin:humanoid                              # a film of the networks that come with the library
   {PROGRAM} builtin:humanoid-heading --viewer web         # steer in a browser: arrow keys, gates, pushes
   {PROGRAM} runs/my-run --output walk.mp4 --seconds 20 --width 1280 --height 720
-  {PROGRAM} --watch runs/my-run --viewer web              # a run in training: each new checkpoint is taken up
+  {PROGRAM} --watch runs/my-run --viewer web              # a run in training: loads each new checkpoint
   {PROGRAM} --agent random task=carry character=humanoid  # look at an environment before training
   {PROGRAM} runs/my-imitation --task switch_interval=.inf --task clip_end=switch
 """
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command."""
     arguments = parse(sys.argv[1:])
     try:
         if arguments.agent is None:
             locate(arguments.checkpoint)
         elif arguments.config_dir:
             find_own_modules()
+        if arguments.viewer is None:
+            require_format(arguments.output)
         announce(PROGRAM)
         from torchrl_mcp.cli.playing import play
         from torchrl_mcp.runs.trust import trusting
@@ -41,7 +44,7 @@ def main() -> None:
 
 
 def parse(words: list[str]) -> argparse.Namespace:
-    """Return the arguments, of which ``checkpoint`` is None and ``settings`` are for an untrained ``agent``."""
+    """Return the arguments; for an untrained ``agent``, ``checkpoint`` is None and ``settings`` configure it."""
     options = parser()
     arguments = options.parse_args(words)
     arguments.settings, arguments.checkpoint = arguments.checkpoint, None
@@ -61,41 +64,39 @@ def parser() -> argparse.ArgumentParser:
         "checkpoint",
         nargs="*",
         metavar="CHECKPOINT",
-        help="run folder, of which the newest checkpoint counts, checkpoint file, builtin:CHARACTER or "
-        "builtin:CHARACTER-TASK; with --agent settings of an environment instead, as torchrl-mcp-train takes them",
+        help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK; with "
+        "--agent instead settings of an environment, as for torchrl-mcp-train",
     )
     add_trust(parser)
-    parser.add_argument("--agent", choices=["zero", "random"], help="actions of zero, or random ones: nothing trained")
+    parser.add_argument("--agent", choices=["zero", "random"], help="zero or random actions instead of a policy")
     parser.add_argument(
-        "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: where settings of your own are"
+        "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: folder of your own settings"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of environment and sampling (default 0)")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the likeliest")
+    parser.add_argument("--seed", type=int, default=0, help="seed of environment and sampling (default 0)")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions (default: deterministic)")
     parser.add_argument(
-        "--task", action="append", default=[], metavar="KEY=VALUE", help="another argument of the task; repeatable"
+        "--task", action="append", default=[], metavar="KEY=VALUE", help="an argument of the task; repeatable"
     )
     parser.add_argument(
         "--ghost-distance",
         type=float,
         default=1.0,
         metavar="D",
-        help="distance of the ghost from the character, in extents of the character; 0 is where it is (default 1)",
+        help="distance of the ghost from the character, in extents of the character; 0 for its true place (default 1)",
     )
     film = parser.add_argument_group("film")
     film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default film.gif)")
-    film.add_argument("--seconds", type=float, default=10.0, help="length (default 10)")
-    film.add_argument("--width", type=int, default=480, help="pixels (default 480)")
-    film.add_argument("--height", type=int, default=360, help="pixels (default 360)")
+    film.add_argument("--seconds", type=float, default=10.0, help="length of the film (default 10)")
+    film.add_argument("--width", type=int, default=480, help="width in pixels (default 480)")
+    film.add_argument("--height", type=int, default=360, help="height in pixels (default 360)")
     viewer = parser.add_argument_group("viewer")
     viewer.add_argument(
         "--viewer",
         choices=["web", "window"],
         help="show it live instead: in a browser on this machine, or in a window",
     )
-    viewer.add_argument(
-        "--watch", action="store_true", help="of a run folder in training: play each new checkpoint as it comes"
-    )
-    viewer.add_argument("--port", type=int, default=0, help="of the page (default: the first free one from 8080)")
+    viewer.add_argument("--watch", action="store_true", help="for a run in training: play each new checkpoint")
+    viewer.add_argument("--port", type=int, default=0, help="port of the page (default: the first free one from 8080)")
     viewer.add_argument(
         "--host",
         default="127.0.0.1",

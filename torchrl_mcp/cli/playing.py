@@ -1,4 +1,4 @@
-"""A policy in a film, in a browser or in a window."""
+"""Showing a policy in a film, in a browser or in a window."""
 
 import argparse
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.build import Agent
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.viewer.film import save_film
@@ -44,11 +44,11 @@ def show(
     """Write a film of a policy, or open a viewer until it is closed.
 
     Args:
-        policy: From what the environment shows to ``action``.
+        policy: From the environment's observations to ``action``.
         env: The environment.
-        options: Number of options among which the policy chooses, 0 if it does not.
+        options: Number of options of the policy, 0 without options.
         arguments: The command line.
-        before_step: What a viewer does before each step.
+        before_step: Called by a viewer before each step.
     """
     look: dict[str, Any] = {
         "deterministic": not arguments.stochastic,
@@ -62,7 +62,7 @@ def show(
             print(arguments.output)
         case "web":
             try:
-                from torchrl_mcp.viewer.web import play_in_browser  # slow to load, as is the window
+                from torchrl_mcp.viewer.web import play_in_browser  # slow to import, like the window
             except ImportError as error:
                 raise RuntimeError(f"Studio is not where mujoco 3.17 has it, install that: {error}") from error
             play_in_browser(
@@ -78,14 +78,14 @@ def _restored(arguments: argparse.Namespace) -> tuple[Agent, CharacterEnv]:
     """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
     path, settings = locate(arguments.checkpoint), _task_settings(arguments)
     try:
-        _, agent, env = experiment.restore(path, num_envs=1, seed=arguments.seed, **settings)
+        _, agent, env = policies.restore(path, num_envs=1, seed=arguments.seed, **settings)
     except TypeError as error:
         raise ValueError(f"--task {' '.join(arguments.task)}: {error}") from error
     return agent, env
 
 
 def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv]:
-    """Return a policy that has learnt nothing, and the environment of a configuration."""
+    """Return an untrained policy, and the environment of a configuration."""
     own = [f"hydra.searchpath=[file://{arguments.config_dir.resolve()}]"] if arguments.config_dir else []
     try:
         cfg = build.compose_run(*own, *arguments.settings)

@@ -9,8 +9,8 @@ from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
 PROGRAM = "torchrl-mcp-publish"
 
 EXAMPLES = f"""\
-The file holds the policy alone, in bfloat16, without what training froze of the networks that come with the library.
-All commands take it as a CHECKPOINT. The card beside it says how it was trained, on what, and what it returns.
+The file holds the policy alone, in bfloat16, without frozen parts of the networks that come with the library. All
+commands take it as a CHECKPOINT. The card beside it has its training, its task and its returns.
 
 examples:
   {PROGRAM} runs/heading --output heading.torchrl --limits "falls on turns of more than 90 degrees"
@@ -38,13 +38,13 @@ def main() -> None:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(PROGRAM, "Write a trained policy as a small file, with a model card beside it.", EXAMPLES)
-    parser.add_argument("run", type=Path, metavar="RUN", help="run folder, of which the newest checkpoint counts")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder, for its newest checkpoint")
     add_trust(parser)
     parser.add_argument(
         "--output", type=Path, required=True, metavar="FILE", help="the file, .torchrl; the card ends in .md"
     )
     parser.add_argument("--limits", action="append", default=[], help="a sentence of the card's limits; repeatable")
-    parser.add_argument("--episodes", type=int, default=128, help="of the evaluation in the card (default 128)")
+    parser.add_argument("--episodes", type=int, default=128, help="episodes of the card's evaluation (default 128)")
     return parser
 
 

@@ -1,38 +1,38 @@
-"""Files of policies and their model cards."""
+"""Published policies and their model cards."""
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
 from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import experiment, policies
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.run_folder import PROVENANCE, read_json
 
 PLACES = ("run_dir=", "run_root=", "resume=")
-"""Beginnings of what a command says of the machine that it ran on, and of nothing else."""
+"""Prefixes of arguments that only concern the machine of the run."""
 
 
 def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) -> None:
-    """Write the policy of a run, evaluate what was written, and write its model card beside it.
+    """Write the policy of a run, evaluate the written file, and write its model card beside it.
 
     Args:
         run: The run folder.
         output: The file.
-        episodes: Of the evaluation, with the seed of the run's own.
-        limits: Sentences about what the policy cannot do.
+        episodes: Episodes of the evaluation, with the seed of the run's own evaluation.
+        limits: Sentences about the policy's limits.
 
     Raises:
         ValueError: If the folder holds no run, or its policy cannot be published.
     """
     cfg = experiment.run_config(run)
-    experiment.publish_run(run, output)
-    numbers = experiment.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
+    policies.publish_run(run, output)
+    numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
     card = output.with_suffix(".md")
     card.write_text(
@@ -54,16 +54,16 @@ def model_card(
 
     Args:
         path: The file.
-        cfg: Configuration of its run.
-        numbers: Its evaluation, as :func:`~torchrl_mcp.runs.experiment.evaluation` returns it.
-        origin: Provenance of the run; what it lacks is unknown.
+        cfg: Configuration of the run.
+        numbers: Evaluation of the file, as returned by :func:`~torchrl_mcp.runs.policies.evaluation`.
+        origin: Provenance of the run; missing entries are written as unknown.
         steps: Environment steps of training.
-        limits: Sentences about what the policy cannot do.
+        limits: Sentences about the policy's limits.
     """
     name = path.stem.removeprefix("mcp-")
     checkpoint_name = f"{PREFIX}{name}" if path.parent.resolve() == FOLDER.resolve() else path.name
-    modes = {"deterministic": numbers["deterministic"], "exploring": numbers["stochastic"]}
-    returns = text_table([{"actions": mode, **_row(of)} for mode, of in modes.items()], markdown=True)
+    modes = ("deterministic", "stochastic")
+    returns = text_table([{"actions": mode, **_row(numbers[mode])} for mode in modes], markdown=True)
     character = CHARACTERS.get(cfg.character.name, cfg.character.name)
     return f"""\
 # {name}
@@ -78,8 +78,8 @@ torchrl-mcp-play {checkpoint_name} --viewer web
 
 ## Returns
 
-Normalised return of the file as it is here, in the task as the paper has it: {numbers["episodes"]} episodes,
-seed {numbers["seed"]}, with the 95 % interval.
+Normalised return of this file in the task of the paper: {numbers["episodes"]} episodes, seed {numbers["seed"]},
+with 95 % intervals.
 
 {returns}
 
@@ -94,8 +94,8 @@ seed {numbers["seed"]}, with the 95 % interval.
 def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -> str:
     """Return the table of how a policy was trained."""
     rows = {
-        "holds": ", ".join(_held(path, cfg)),
-        "trained": f"{steps:,} steps, preset {origin.get('choices', {}).get('preset', 'unknown')}, seed {cfg.seed}",
+        "contents": _contents(path, cfg),
+        "training": f"{steps:,} steps, preset {origin.get('choices', {}).get('preset', 'unknown')}, seed {cfg.seed}",
         "command": f"`{command(origin.get('command', []))}`",
         "commit": origin.get("commit") or "unknown",
         "machine": origin.get("machine", {}).get("processor", "unknown"),
@@ -105,18 +105,17 @@ def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -
 
 
 def command(words: Sequence[str]) -> str:
-    """Return the command that began a run, without what it says of the machine's folders."""
+    """Return the command that started a run, without folders of the machine."""
     return shlex.join(word for word in words if not word.startswith(PLACES))
 
 
-def _held(path: Path, cfg: DictConfig) -> Iterator[str]:
-    """What is in a file, and where the rest of the policy is."""
-    if shared := checkpoint.shared(path):
-        yield "the gate and the normaliser of its goal"
-        origin = builtin(cfg.method.name, cfg.character.name)
-        yield f"over {' and '.join(shared)} of `{origin.name}`, frozen, which imitate the library's generated motions"
-    else:
-        yield "the whole policy"
+def _contents(path: Path, cfg: DictConfig) -> str:
+    """Return the contents of a file, and the source of the policy's other parts."""
+    if not (shared := checkpoint.shared(path)):
+        return "the whole policy"
+    origin = builtin(cfg.method.name, cfg.character.name)
+    names = " and ".join(f"`{name}`" for name in shared)
+    return f"the gate and the normaliser of its goal; the frozen parts {names} are in `{origin.name}`"
 
 
 def _row(numbers: Mapping[str, Any]) -> dict[str, str]:
@@ -134,8 +133,8 @@ def _paper(cfg: DictConfig) -> str:
     """Return a sentence about Table 2, if it has the cell."""
     reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
     if cfg.stage.name != "transfer" or reported is None:
-        return "The paper reports no such policy."
+        return "The paper has no return to compare with."
     return (
-        f"The paper's {cfg.method.title} reaches {reported.mean:.3f} ± {reported.std:.3f}, after a budget that it does "
-        "not state."
+        f"The paper's {cfg.method.title} reaches {reported.mean:.3f} ± {reported.std:.3f}; its training budget is not "
+        "stated."
     )

@@ -35,7 +35,7 @@ def main() -> None:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(PROGRAM, "Write the results of many runs beside the paper's, as a web page and as Markdown.")
-    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or folders that hold some at any depth")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or folders with run folders at any depth")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write to (default report)")
     return parser
 

@@ -1,4 +1,4 @@
-"""What a run says when it ends: its numbers, its folder, and what to do next."""
+"""The summary that a run prints at its end: results, folder, and next commands."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETUR
 
 
 def summary(folder: Path) -> str:
-    """Return the last words of the run in a folder: returns beside the paper's, and the next commands."""
+    """Return the summary of the run in a folder: returns beside the paper's, and the next commands."""
     lines = [f"run folder: {folder}", *_returns(folder), "next:"]
     lines += [f"  torchrl-mcp-{command}" for command in (f"play {folder}", f"evaluate {folder}", f"report {folder}")]
     return "\n".join(lines)
@@ -21,7 +21,7 @@ def summary(folder: Path) -> str:
 def final_return(folder: Path) -> float | None:
     """Return the normalised return of the run in a folder, or None if no episode has ended.
 
-    That of its evaluation, with deterministic actions; without one, the last of training.
+    It is the return of the evaluation with deterministic actions, or without one, the last return of training.
     """
     if evaluation := _evaluation(folder):
         return evaluation["deterministic"]["normalised_return"]
@@ -29,35 +29,35 @@ def final_return(folder: Path) -> float | None:
 
 
 def last_return(folder: Path) -> float | None:
-    """Return the normalised return of the last iteration of training in which an episode ended, None if none has."""
+    """Return the normalised return of the last iteration in which an episode ended, None if none has."""
     returns = [row.get(NORMALISED_RETURN, math.nan) for row in read_metrics(folder)]
     return next((value for value in reversed(returns) if math.isfinite(value)), None)
 
 
 def _returns(folder: Path) -> list[str]:
-    """Lines of returns: with deterministic actions, exploring, and in the paper."""
+    """Return lines with the returns of deterministic and of sampled actions, and of the paper."""
     if not (evaluation := _evaluation(folder)):
         last = last_return(folder)
         return [f"normalised return in training: {'no episode has ended' if last is None else f'{last:.3f}'}"]
-    modes = {"deterministic": evaluation["deterministic"], "exploring": evaluation["stochastic"]}
+    modes = {mode: evaluation[mode] for mode in ("deterministic", "stochastic")}
     values = [
         "{} {:.3f} ({:.3f} to {:.3f})".format(mode, numbers["normalised_return"], *numbers["interval"])
         for mode, numbers in modes.items()
     ]
-    episodes = f"normalised return of {evaluation['episodes']} episodes, with its 95 % interval:"
+    episodes = f"normalised return of {evaluation['episodes']} episodes, with 95 % intervals:"
     if reach := modes["deterministic"].get("reach"):
         standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
-        values.insert(1, f"{reach['place']:.0%} of the way from standing still, {standing}, to the ideal, {ideal}")
+        values.insert(1, f"{reach['place']:.0%} of the way from standing still ({standing}) to the ideal ({ideal})")
     return [episodes, *(f"  {value}" for value in [*values, *_paper(OmegaConf.load(folder / CONFIG))])]
 
 
 def _paper(cfg: Any) -> list[str]:
-    """Table 2 of the paper for a run that transfers, if it has this cell."""
+    """Return a line with the paper's return of Table 2 for a transfer run, or none."""
     assert isinstance(cfg, DictConfig)
     reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
     if cfg.stage.name != "transfer" or reported is None:
         return []
-    return [f"paper {reported.mean:.3f} +- {reported.std:.3f}, after a budget that it does not state"]
+    return [f"paper {reported.mean:.3f} +- {reported.std:.3f} (training budget not stated)"]
 
 
 def _evaluation(folder: Path) -> dict[str, Any]:

@@ -1,10 +1,13 @@
-"""``torchrl-mcp-train``: train a method on a task, alone, in a Hydra multirun, or as a benchmark of many."""
+"""``torchrl-mcp-train``: train a method on a task, as a single run, a Hydra multirun or a benchmark."""
 
 import argparse
 import sys
 from importlib.resources import files
 
 from torchrl_mcp.cli.parsing import add_trust, find_own_modules, new_parser, take_trust
+from torchrl_mcp.training.workers import end_with_parent_while_starting
+
+end_with_parent_while_starting()  # before the imports that take a worker seconds
 
 PROGRAM = "torchrl-mcp-train"
 
@@ -12,13 +15,13 @@ GROUPS = (
     *("method", "task", "character", "stage", "motions", "imitation", "practice", "preset", "benchmark"),
     *("mixer", "gating", "primitives", "exploration", "optimizer", "collector", "logger"),
 )
-"""Groups of settings that are chosen on the command line; the others come with a method."""
+"""Groups of settings for the command line; the choices of other groups come with a method."""
 
 SETTINGS = {
     "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
-    "seed=N": "of networks, environments and sampling (default 0)",
+    "seed=N": "seed of networks, environments and sampling (default 0)",
     "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
-    "resume=FOLDER": "run folder to continue, alone",
+    "resume=FOLDER": "run folder to continue; takes no other settings",
     "training.total_frames=N": "environment steps",
     "device=cuda": "networks on a GPU; physics stays on the CPU",
     "physics=warp": "with device=cuda, physics on the GPU as well, by the extra torchrl-mcp[warp]",
@@ -35,7 +38,7 @@ examples:
 
 
 def main() -> None:
-    """Run the command line, and where it names an unknown setting say which one was perhaps meant."""
+    """Run the command line; if it names an unknown setting, suggest similar names."""
     trusted, words = take_trust(sys.argv[1:])
     if own := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(own))
@@ -58,18 +61,28 @@ def main() -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of ``--help``. Hydra, which parses all else, takes longer to import than to be read."""
-    parser = new_parser(PROGRAM, "Train a method on a task, alone, in a Hydra multirun, or as a benchmark.", _epilog())
+    """Return the parser of ``--help``. Hydra parses all else, but its import is too slow for ``--help``."""
+    parser = new_parser(
+        PROGRAM, "Train a method on a task, as a single run, a Hydra multirun or a benchmark.", _epilog()
+    )
     parser.add_argument("settings", nargs="*", metavar="SETTING=VALUE", help="see below")
     parser.add_argument("-m", "--multirun", action="store_true", help="run every combination of values: seed=0,1,2")
     parser.add_argument(
-        "-cd", "--config-dir", metavar="FOLDER", help="where settings of your own are, whose modules may be here"
+        "-cd",
+        "--config-dir",
+        metavar="FOLDER",
+        help="folder of your own settings; their modules may be in the working directory",
     )
-    parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration, do nothing else")
+    parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration without training")
     parser.add_argument("--resolve", action="store_true", help="with --cfg: print values in place of references")
-    parser.add_argument("-sc", "--shell-completion", action="store_true", help="install with -sc install=bash")
+    parser.add_argument(
+        "-sc",
+        "--shell-completion",
+        action="store_true",
+        help="complete names in a shell: install it with -sc install=bash",
+    )
     add_trust(parser)
-    parser.add_argument("--hydra-help", action="store_true", help="what else Hydra has")
+    parser.add_argument("--hydra-help", action="store_true", help="print Hydra's own options")
     return parser
 
 

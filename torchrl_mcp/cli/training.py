@@ -1,7 +1,8 @@
-"""What Hydra calls: a run, or a benchmark of many."""
+"""Training by Hydra: one run, or a benchmark of many."""
 
 import argparse
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import hydra
@@ -15,9 +16,21 @@ from torchrl_mcp.training.run_folder import CONFIG
 PROGRAM = "torchrl-mcp-train"
 
 
+def run() -> None:
+    """Let Hydra train, or print the configuration.
+
+    ``--cfg hydra`` drops the run's settings, so that ``--resolve`` would fail at references to them. Printing a package
+    of all settings does not drop them.
+    """
+    printed = any(pair in (("--cfg", "hydra"), ("-c", "hydra")) for pair in pairwise(sys.argv))
+    if "--resolve" in sys.argv and (printed or "--cfg=hydra" in sys.argv):
+        sys.argv += ["--cfg", "all", "--package", "hydra"]  # argparse takes the last value of an option
+    train()
+
+
 @hydra.main(version_base="1.3", config_path="pkg://torchrl_mcp.conf", config_name="train")
-def run(cfg: DictConfig) -> float | None:
-    """Train as ``cfg`` says, or continue ``cfg.resume``, and return the final return, which sweepers optimise."""
+def train(cfg: DictConfig) -> float | None:
+    """Train as configured, or continue ``cfg.resume``, and return the final return, which sweepers optimise."""
     announce(PROGRAM)
     from torchrl_mcp.cli.summary import final_return, summary
     from torchrl_mcp.runs import experiment
@@ -37,15 +50,15 @@ def run(cfg: DictConfig) -> float | None:
 
 
 def _what_is_safe(cfg: DictConfig) -> str:
-    """Return what a run that failed has left, and how to go on."""
+    """Return a sentence on the saved state of a failed run, and how to continue."""
     folder = Path(cfg.resume or cfg.run_dir)
     if not (folder / CONFIG).is_file():
-        return "No run has begun: mend the cause, and give the same command again"
-    return f"All up to the last checkpoint is safe in {folder}: go on with {PROGRAM} resume={folder}"
+        return "No run has begun: fix the cause and repeat the command"
+    return f"The run is safe up to its last checkpoint in {folder}: go on with {PROGRAM} resume={folder}"
 
 
 def run_benchmark(arguments: list[str]) -> None:
-    """Run many runs, or what is left of them."""
+    """Run a benchmark, or continue it."""
     parser = argparse.ArgumentParser(PROGRAM, add_help=False, allow_abbrev=False)
     parser.add_argument("--config-dir", "-cd", type=Path)
     options, settings = parser.parse_known_args(arguments)
@@ -64,7 +77,7 @@ def run_benchmark(arguments: list[str]) -> None:
     except (OSError, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
-        sys.exit(f"\n{PROGRAM}: interrupted; call it again to go on from here")
+        sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
 
 
 def _resume(folder: Path) -> Path:
@@ -72,7 +85,7 @@ def _resume(folder: Path) -> Path:
 
     given = HydraConfig.get().overrides.task
     if ignored := [setting for setting in given if not setting.startswith("resume=")]:
-        raise ValueError(f"a run goes on with the settings that it began with: leave out {' '.join(ignored)}")
+        raise ValueError(f"a resumed run keeps its settings: leave out {' '.join(ignored)}")
     if experiment.is_complete(folder):
         print(f"{folder} is complete: nothing is left to do")
     return experiment.resume(folder)

@@ -10,7 +10,7 @@ from torch.distributions import Categorical, Distribution, Independent, MixtureS
 from torchrl_mcp.distributions.multiplicative import broadcast_primitives
 
 # Normalising multiplies the gradient by 1 / sum(w), on top of log-densities that reach 1e17 when narrow primitives meet
-# wide ones: the product must stay in float32. Softmax and all but dead sigmoid gates are far above.
+# wide ones: the product must stay in float32. The sum of softmax gates or of open sigmoid gates is far above.
 GATES_FLOOR = 1e-8
 
 
@@ -20,9 +20,9 @@ class AdditiveGaussian(MixtureSameFamily):
     .. math:: \pi(a) = \sum_{k=1}^K \bar w_k \, \mathcal{N}(a; \mu_k, \sigma_k^2), \qquad
         \bar w_k = \frac{w_k}{\sum_{j=1}^K w_j}
 
-    The sum of the gates is never taken below ``1e-8``; where it would be, equal gates make up the difference, so that
-    without validation all gates closed are a mixture in equal parts and not a division by zero. Arguments of half
-    precision are promoted to ``float32``, and so are the samples.
+    The sum of the gates is at least ``1e-8``: below that, equal gates make up the difference. Without validation,
+    closed gates thus result in an equal mixture instead of a division by zero. Arguments of half precision are promoted
+    to ``float32``, and so are the samples.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
@@ -80,12 +80,12 @@ class AdditiveGaussian(MixtureSameFamily):
         log_probs = self.component_distribution.log_prob(value.unsqueeze(-2))
         gates = self.mixture_distribution.probs
         info = torch.finfo(gates.dtype)
-        # Not inherited, because torch raises every weight to 1e-7: a closed primitive would then own the tails, and
-        # get no gradient. Around this anchor, which cancels, an open primitive adds at most 1 to the sum.
+        # Not inherited: torch raises every weight to 1e-7, so that a closed primitive would dominate the tails without
+        # a gradient. The anchor cancels; relative to it, an open primitive adds at most 1 to the sum.
         shares = gates.log() + log_probs
         anchor = shares.amax(-1, keepdim=True).detach()
-        # A closed one adds nothing however likely it makes the action; only its slope needs a bound. That of one whose
-        # gate is subnormal is bounded by what the type can hold.
+        # A closed primitive adds nothing, however likely the action: only its gradient needs a bound. The bound of an
+        # open primitive is the range of the type, which only subnormal gates reach.
         bound = torch.where(gates > 0, math.log(info.max) - 0.5, -math.log(info.eps))
         terms = gates * (log_probs - anchor).clamp_max(bound).exp()
         terms = torch.where(gates < info.tiny, terms + ((shares - anchor).exp() - terms).detach(), terms)
@@ -124,6 +124,6 @@ class AdditiveGaussian(MixtureSameFamily):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The mean of the most likely primitive, shape ``(*B, A)``; between two modes the mixture's own is poor."""
+        """The mean of the most likely primitive, shape ``(*B, A)``; the mixture's mean may lie between modes."""
         index = self.mixture_distribution.probs.argmax(-1)[..., None, None]
         return torch.take_along_dim(self.component_distribution.mean, index, dim=-2).squeeze(-2)

@@ -24,12 +24,11 @@ class MultiplicativeGaussian(Independent):
         \frac{1}{\sigma^2} = \sum_{k=1}^K \frac{w_k}{\sigma_k^2}, \qquad
         \mu = \sigma^2 \sum_{k=1}^K \frac{w_k}{\sigma_k^2} \mu_k
 
-    Sampling, densities, entropy and Kullback-Leibler divergences are those of
-    :class:`torch.distributions.Independent`.
+    Sampling, densities, entropy and Kullback-Leibler divergences come from :class:`torch.distributions.Independent`.
 
-    The precision :math:`1 / \sigma^2` is never taken below ``1e-8`` (a standard deviation of ``1e4``); where it would
-    be, a zero-mean Gaussian makes up the difference, so that with all gates closed the composite is
-    :math:`\mathcal{N}(0, 10^8)` and not a division by zero. Values and gradients are finite there as well.
+    The precision :math:`1 / \sigma^2` is at least ``1e-8`` (a standard deviation of ``1e4``): below that, a zero-mean
+    Gaussian makes up the difference. With all gates closed the composite is :math:`\mathcal{N}(0, 10^8)` instead of a
+    division by zero. Values and gradients are finite there as well.
 
     Arguments of half precision are promoted to ``float32``, and so are the samples: a ``bfloat16`` log-density over
     tens of actions is off by more than the clip range of a policy ratio.
@@ -61,7 +60,7 @@ class MultiplicativeGaussian(Independent):
         loc, scale, gates = broadcast_primitives(loc, scale, gates, validate_args)
         gates = gates.unsqueeze(-1)
         log_precision = -2 * scale.log()
-        # log sum_k w_k exp(x_k) around an anchor, which cancels: unlike logsumexp(log w + x), it has a slope at w = 0.
+        # log sum_k w_k exp(x_k) around an anchor that cancels: unlike logsumexp(log w + x), it has a gradient at w = 0.
         anchor = (gates.log() + log_precision).amax(-2, keepdim=True).clamp_min(LOG_PRECISION_FLOOR).detach()
         weights = gates * (log_precision - anchor).exp()
         total = weights.sum(-2, keepdim=True).clamp_min((LOG_PRECISION_FLOOR - anchor).exp())
@@ -75,7 +74,7 @@ class MultiplicativeGaussian(Independent):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The mean, shape ``(*B, A)``: what TorchRL plays when exploration is off."""
+        """The mean, shape ``(*B, A)``, which TorchRL plays when exploration is off."""
         return self.mean
 
 
@@ -104,7 +103,7 @@ def broadcast_primitives(
 
 
 def check_primitives(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
-    """Refuse primitives and gates out of which no distribution can be composed.
+    """Check that primitives and gates make a distribution.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
@@ -112,7 +111,7 @@ def check_primitives(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
         gates: Weights, shape ``(*B, K)``.
 
     Raises:
-        ValueError: Naming the argument, its value or shape, and the remedy.
+        ValueError: If not, with the argument, its value or shape, and the remedy.
     """
     shapes = f"loc {tuple(loc.shape)}, scale {tuple(scale.shape)} and gates {tuple(gates.shape)}"
     remedy = "pass loc and scale of shape (*B, K, A) and gates of shape (*B, K)"
@@ -127,5 +126,5 @@ def check_primitives(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
         ("scale", scale, scale.isfinite() & (scale > 0), "positive and finite; pass it through an exp or a softplus"),
         ("gates", gates, gates.isfinite() & (gates >= 0), "non-negative and finite; end the gate in a sigmoid"),
     ):
-        if not torch._is_all_true(valid):  # as torch.distributions asks it: all() has no answer under vmap
+        if not torch._is_all_true(valid):  # as in torch.distributions: all() fails under vmap
             raise ValueError(f"{name} of shape {tuple(value.shape)} holds {value[~valid][0].item()}, must be {rule}.")

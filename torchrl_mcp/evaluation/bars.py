@@ -6,20 +6,20 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 WIDTH = 60
-"""Columns."""
+"""Width of a bar in columns."""
 
 
 def bar(
     total: int | None, label: str, *, file: TextIO | None = None, leave: bool = False, form: str = "", **kwargs: Any
 ) -> tqdm:
-    """Return a bar of :data:`WIDTH` columns, which shows nothing where there is no terminal.
+    """Return a bar of :data:`WIDTH` columns, which is hidden without a terminal.
 
     Args:
-        total: Steps in all, None where nobody knows.
-        label: What is under way.
+        total: Number of steps, None if unknown.
+        label: Text before the bar.
         file: The terminal, standard error by default.
         leave: Keep the bar when it is full.
-        form: What follows the bar, as of ``tqdm``'s ``bar_format``.
+        form: Text after the bar, in ``tqdm``'s ``bar_format``.
         **kwargs: Passed on to ``tqdm``.
     """
     return tqdm(

@@ -15,12 +15,12 @@ class ClipResult:
     """Statistics of the episodes that follow one clip.
 
     Attributes:
-        clip: Its name.
-        seconds: Its duration, of one cycle where it loops.
+        clip: Name of the clip.
+        seconds: Duration of the clip, or of one cycle if it loops.
         episodes: Number of episodes.
-        completed: Share of them that neither fell nor lost the reference.
-        tracking_error: Mean distance of the bodies from the reference in metres, of the mean episode.
-        length: Mean length in control steps.
+        completed: Share of episodes that neither fell nor lost the reference.
+        tracking_error: Mean distance of the bodies from the reference in metres, averaged over episodes.
+        length: Mean length of an episode in control steps.
     """
 
     clip: str
@@ -34,15 +34,15 @@ class ClipResult:
 def follow_each(
     policy: TensorDictModuleBase, env: Imitation, *, deterministic: bool = True, device: torch.device | str = "cpu"
 ) -> list[ClipResult]:
-    """Follow every clip in equally many episodes, which begin at moments spread evenly over it.
+    """Follow every clip in the same number of episodes, which begin at times spread evenly over it.
 
-    An episode that fits into its clip begins early enough to do so.
+    If a clip is longer than an episode, the episodes begin early enough to end within it.
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``.
-        env: Environments without changes of the reference, a multiple of the number of clips.
+        env: Environments without changes of the reference; their number is a multiple of the number of clips.
         deterministic: Play the deterministic action rather than a sample.
-        device: Where the policy is.
+        device: Device of the policy.
 
     Raises:
         ValueError: If the reference may change, or the clips do not divide the environments.

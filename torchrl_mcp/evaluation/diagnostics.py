@@ -10,20 +10,20 @@ from torchrl_mcp.modules import gate_diagnostics
 DIAGNOSED = ("gates", "option", "begins")
 
 COLLAPSED = 1.1
-"""Effective number of options up to which one of them does everything."""
+"""Effective number of options at or below which they count as collapsed into one."""
 
 
 def diagnosed(actor: Actor) -> list[str]:
-    """Return the keys that :func:`diagnostics` reads of what an actor writes."""
+    """Return the keys of an actor's output that :func:`diagnostics` reads."""
     return [key for key in DIAGNOSED if key in actor.stored]
 
 
 def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
-    """Summarise the gates and options by which an actor acted.
+    """Summarise the gates and options of an actor over samples.
 
     Args:
         actor: The actor.
-        samples: What it did, of any batch shape, with the keys ``actor.stored``.
+        samples: Samples of the actor, of any batch shape, with the keys ``actor.stored``.
 
     Returns:
         Numbers of :func:`~torchrl_mcp.modules.gate_diagnostics` under ``gates/``, if there are gates, and of
@@ -37,4 +37,4 @@ def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
     named = {f"{group}/{name}": value for group, values in found.items() for name, value in values.items()}
     if not named:
         return {}
-    return dict(zip(named, torch.stack(list(named.values())).tolist(), strict=True))  # in one go, off a GPU
+    return dict(zip(named, torch.stack(list(named.values())).tolist(), strict=True))  # one transfer from a GPU

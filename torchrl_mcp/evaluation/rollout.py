@@ -25,10 +25,10 @@ class Evaluation:
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
-        metrics: What else the task observes, by name, ``(N,)``: of a flag, whether it was ever raised in the episode,
-            as ``success``; of a number, its mean over the steps, as ``tracking_error``.
-        decisions: What was recorded of the policy, of all steps of all episodes, batch size ``(M,)``.
-        reach: Returns of who stands still and of an ideal player in the same episodes, if the task says.
+        metrics: Other measurements of the task by name, ``(N,)``: for a flag such as ``success``, whether it was ever
+            raised in the episode; for a number such as ``tracking_error``, its mean over the steps.
+        decisions: Recorded outputs of the policy, for all steps of all episodes, batch size ``(M,)``.
+        reach: Returns of standing still and of an ideal player in the same episodes, if the task computes them.
     """
 
     returns: Tensor
@@ -55,12 +55,12 @@ def evaluate(
     Counting the first episodes to finish instead would favour short ones.
 
     Args:
-        policy: From what the environments show, as ``observation`` and ``goal``, to ``action``.
-        env: Environments with batch size ``[N]`` whose episodes all end; what ``env.metric_names`` lists is measured.
+        policy: From keys of the environments, such as ``observation`` and ``goal``, to ``action``.
+        env: Environments with batch size ``[N]`` whose episodes all end; ``env.metric_names`` lists the ``metrics``.
         deterministic: Play the deterministic action rather than a sample.
-        start: State to begin from, as of ``env.get_state()``, or None to draw it.
-        record: Keys of what the policy writes that are kept as ``decisions``.
-        device: Where the policy is.
+        start: State to begin from, as returned by ``env.get_state()``, or None to draw it.
+        record: Keys of the policy's output to keep as ``decisions``.
+        device: Device of the policy.
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     state = env.reset() if start is None else env.reset(start, set_state=True)
@@ -104,7 +104,7 @@ def evaluate(
 
 
 def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Return means over episodes, and how sure they are.
+    """Return means over episodes, and their uncertainty.
 
     Args:
         outcome: The episodes.
@@ -112,7 +112,7 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``metrics``; where the task says, ``reach``: the returns ``standing`` and ``ideal``, and the
+        fraction, ``metrics``; if the task has it, ``reach``: the returns ``standing`` and ``ideal``, and the
         ``place`` between them, from 0 to 1), the standard deviation over episodes (0 of a single one), and a 95 %
         percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
     """

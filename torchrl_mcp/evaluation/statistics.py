@@ -5,12 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import bootstrap, trim_mean
 
 CONFIDENCE = 0.95
 
 BATCH = 10_000_000
-"""Values that are resampled at a time, which bounds the memory."""
+"""Number of values that are resampled at a time; it bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,8 @@ class Estimate:
 
     Attributes:
         value: The number.
-        low: Lower end of its 95 % interval, NaN where there is nothing to resample.
-        high: Upper end.
+        low: Lower end of its 95 % interval, NaN if there is nothing to resample.
+        high: Upper end of the interval.
     """
 
     value: float
@@ -31,7 +30,7 @@ class Estimate:
 def mean(values: Sequence[float]) -> Estimate:
     """Return the mean with its percentile bootstrap interval.
 
-    Of three values the interval is their range: one in 27 resamples holds the least of them three times.
+    The interval of three values is their range: one resample in 27 holds the smallest value three times.
 
     Raises:
         ValueError: If there is no value.
@@ -57,19 +56,23 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
         Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", 2021,
         https://arxiv.org/abs/2108.13264
     """
+    from scipy.stats import trim_mean  # slow to import
+
     return _estimate(strata, lambda values, axis: trim_mean(values, 0.25, axis=axis))
 
 
 def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[str, ...] = ()) -> dict[str, float]:
-    """Return the means of what all have, by name, but for names that begin with ``left_out``."""
+    """Return, by name, the means of numbers that all runs have, except names that begin with ``left_out``."""
     shared = [name for name in (numbers[0] if numbers else {}) if all(name in other for other in numbers)]
     kept = [name for name in shared if not name.startswith(left_out)]
     return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
 
 
 def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray]) -> Estimate:
+    from scipy.stats import bootstrap  # slow to import
+
     if not strata or not all(len(values) for values in strata):
-        raise ValueError(f"values={list(map(list, strata))} lack some: leave out what was not evaluated")
+        raise ValueError(f"values={list(map(list, strata))} hold an empty list: leave out what was not evaluated")
     value = float(statistic(np.concatenate(strata), axis=0))
     if any(len(values) < 2 for values in strata):
         return Estimate(value)

@@ -1,1 +1,1 @@
-"""The seven methods, a file for each word of the command line, and what several of them share."""
+"""The seven methods, one file for each value of ``method=``, and the parts that several of them share."""

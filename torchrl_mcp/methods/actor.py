@@ -1,16 +1,17 @@
 """The actor that all methods build: networks as TensorDictModules.
 
-A method first makes named *parts*, plain modules that transfer keeps, freezes or starts anew by their names, and then
-an :class:`Actor` over them: the ``policy`` that acts, and what the loss differentiates, ``trained``. Both are one and
-the same unless the primitives are frozen, the exploration acts on the gate, or noise enters before the action.
+A method first makes named *parts*, plain modules that transfer keeps, freezes or re-initialises by name. Then it makes
+an :class:`Actor` over them: ``policy`` acts, and the loss differentiates ``trained``. These are the same module unless
+the primitives are frozen, the exploration acts on the gate, or noise enters before the action.
 
 | key | content | shape |
 |---|---|---|
-| ``observation``, ``goal`` | state and goal as the environment gives them | ``(*B, S)``, ``(*B, G)`` |
+| ``observation``, ``goal`` | state and goal from the environment | ``(*B, S)``, ``(*B, G)`` |
 | ``normalised`` / ``observation``, ``goal`` | the same, standardised and clipped | |
 | ``gate_logits``, ``gates`` | before and after the gate's activation | ``(*B, K)`` |
 | ``primitives`` / ``loc``, ``scale`` | means and standard deviations of the primitives | ``(*B, K, A)`` |
-| ``action`` | what the environment plays | ``(*B, A)`` |
+| ``noise`` | from the environment, for exploration alone | ``(*B, K)`` |
+| ``action`` | input of the environment | ``(*B, A)`` |
 """
 
 from collections.abc import Callable
@@ -33,13 +34,15 @@ from torchrl_mcp.modules.normaliser import RunningNormaliser
 STATE = ("normalised", "observation")
 GOAL = ("normalised", "goal")
 PRIMITIVES = (("primitives", "loc"), ("primitives", "scale"))
+NOISE = "noise"
+"""Read by policies that explore, and ignored by their deterministic actions."""
 
 Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
 
 Explorer = Callable[[Tensor], Tensor]
-"""From normalised states ``(N, S)`` to actions ``(N, A)``, blind to any goal: random exploration of Section 5.3.
+"""Random exploration of Section 5.3: from normalised states ``(N, S)`` to actions ``(N, A)``, without a goal.
 
-A method names as ``method.explorer`` what makes one from its parts, the number N and a generator.
+``method.explorer`` makes one from the parts, the number N and a generator.
 """
 
 
@@ -48,10 +51,10 @@ class Actor:
     """A policy in parts.
 
     Attributes:
-        policy: What collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
-        trained: What the loss differentiates: gives the distribution of ``sampled`` from a stored sample.
+        policy: Module that collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
+        trained: Module that the loss differentiates: from a stored sample to the distribution of ``sampled``.
         stored: Keys, beside the environment's own, that a sample must hold for the loss and the diagnostics.
-        drawn: Those of ``stored`` that are drawn at random, rather than computed of ``observation`` and ``goal``.
+        drawn: Keys of ``stored`` with random values, rather than values computed from ``observation`` and ``goal``.
         sampled: Key of the random variable whose log-probability the policy gradient takes.
     """
 

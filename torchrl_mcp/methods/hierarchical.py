@@ -1,4 +1,4 @@
-"""The hierarchical baseline: a gate picks one of K primitives and keeps to it for a walk cycle (Section E.4)."""
+"""The hierarchical baseline: a gate picks one of K primitives and keeps it for a walk cycle (Section E.4)."""
 
 from collections.abc import Callable, Collection
 
@@ -50,7 +50,7 @@ def gated_parts(
     num_options: int,
     normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
-    """Make the parts of transfer: those of :func:`primitive_parts` and ``gating``.
+    """Make the parts of transfer: the parts of :func:`primitive_parts` and ``gating``.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -69,7 +69,7 @@ def gated_parts(
 
 
 def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> OptionActor:
-    """Let the primitive act that the environment names as ``option``: all are trained side by side.
+    """Let the primitive act whose index the environment sends as ``option``; all primitives train side by side.
 
     Args:
         parts: Made by :func:`primitive_parts`.
@@ -83,7 +83,7 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
 def gated_actor(
     parts: nn.ModuleDict, *, num_options: int, steps_per_choice: int, frozen: Collection[str] = ()
 ) -> OptionActor:
-    r"""Draw a primitive from the gate :math:`w(s, g)` every so many steps, and let it act meanwhile.
+    r"""Draw a primitive from the gate :math:`w(s, g)` every ``steps_per_choice`` steps, and let it act in between.
 
     Args:
         parts: Made by :func:`gated_parts`.
@@ -132,10 +132,10 @@ def random_sequence(
 
 
 class Clock(nn.Module):
-    """The clock that says when the gate chooses again."""
+    """Decides when the gate chooses again."""
 
     def __init__(self, steps_per_choice: int) -> None:
-        """Take the number of steps from one choice to the next."""
+        """Set the number of control steps between choices."""
         super().__init__()
         self.steps_per_choice = steps_per_choice
 

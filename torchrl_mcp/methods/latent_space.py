@@ -3,14 +3,14 @@ r"""The latent space model (Section E.7): an encoder turns goals into skills, a 
 .. math:: w = \mu_q + \sigma_q \epsilon, \qquad \epsilon \sim \mathcal{N}(0, I), \qquad
     \pi(a|s, w) = \mathcal{N}(\mu(s, w), \mathrm{diag}(\sigma^2))
 
-The noise :math:`\epsilon` is stored with each sample, as if it were a part of the state. The loss takes the ratio of
-policies at the same noise and differentiates through :math:`w`, which is how the encoder learns.
+The noise :math:`\epsilon` is stored with each sample, as if it were part of the state. The loss takes the ratio of
+policies at the same noise and differentiates through :math:`w`, which trains the encoder.
 
 | key | content | shape |
 |---|---|---|
 | ``latent`` / ``noise`` | :math:`\epsilon` | ``(*B, L)`` |
 | ``latent`` / ``loc``, ``scale`` | mean and standard deviation of the encoder | ``(*B, L)`` |
-| ``latent`` / ``sample`` | what the decoder sees of the goal, :math:`w` | ``(*B, L)`` |
+| ``latent`` / ``sample`` | latent variable :math:`w`, the decoder's view of the goal | ``(*B, L)`` |
 
 Reference:
     Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
@@ -73,7 +73,7 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
 
     Args:
         parts: Made by :func:`latent_parts`.
-        frozen: Names of the parts that do not change in training; gradients pass through a frozen decoder all the same.
+        frozen: Names of the parts that do not change in training; gradients still pass through a frozen decoder.
     """
     encoder = (
         normalise_inputs(parts),

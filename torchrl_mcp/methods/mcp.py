@@ -1,9 +1,9 @@
 """MCP: a gate composes primitives into one action distribution, Eq. 4 and Algorithm 1.
 
-The mixture of experts (Section E.6) is the same with another mixer, gate and primitives.
+The mixture of experts (Section E.6) has the same parts and actor, with another mixer, gate and primitives.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
@@ -46,13 +46,13 @@ def composite_parts(
         action_dim: Size of the action, ``A``.
         gating: Makes the network for gate logits from ``(S, G, K)``.
         gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
-        primitives: Makes the primitives from ``(S, A, K, initial_std=)``; what it makes has a method ``rescale``, as
+        primitives: Makes the primitives from ``(S, A, K, initial_std=)``; they need a method ``rescale`` like
             :meth:`~torchrl_mcp.modules.Primitives.rescale`.
         num_primitives: Number of primitives, ``K``.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
-        initial_std: Standard deviation of the *composite* before training, in action units, whatever ``K`` and mixer:
-            of its actions in one state, by the spread of each primitive and by what lies between them, as a root mean
-            square over normalised states and over actions.
+        initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixer. It
+            includes the variance of each primitive and the variance between their means, and is a root mean square over
+            normalised states and actions.
         normaliser: Makes an input normaliser from a size.
 
     Raises:
@@ -60,8 +60,8 @@ def composite_parts(
     """
     if num_primitives < 1:
         raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
-    # Both mixers scale with their primitives. First compose K unit Gaussians at the gate's initial weights and divide;
-    # then do the same with the networks as they are, whose primitives lie apart from one another.
+    # A composite's standard deviation is proportional to its primitives'. First compose K unit Gaussians at the gate's
+    # initial weights and divide. Then do the same with the networks, whose primitives have different means.
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
@@ -126,18 +126,21 @@ def weights_actor(
     gate_activation: nn.Module,
     distribution_class: Composition,
     logits_std: float,
+    noise: str | None = None,
     frozen: Collection[str] = (),
 ) -> Actor:
     r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
 
-    The gate's logits are Gaussian with a fixed standard deviation. They are what the policy gradient scores, so that
-    the primitives appear in no gradient and must be frozen.
+    The gate's logits are Gaussian with a fixed standard deviation, and the policy gradient uses their density. So the
+    primitives have no gradient and must be frozen.
 
     Args:
         parts: Made by :func:`composite_parts`.
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
         logits_std: Standard deviation of the logits.
+        noise: Key of standard normal noise ``(*B, K)`` for the logits, such as the key of
+            :class:`~torchrl_mcp.methods.transforms.CorrelatedNoise`; None draws independent noise in each step.
         frozen: Names of the parts that do not change in training.
 
     Raises:
@@ -148,14 +151,17 @@ def weights_actor(
             "exploration over weights trains the gate alone: use it with stage=transfer and keep 'primitives' in "
             "transfer.freeze, or take exploration=action"
         )
-    trained = ProbabilisticTensorDictSequential(
+    gate = (
         normalise_inputs(parts),
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_loc"]),
         TensorDictModule(ConstantScale(logits_std), in_keys=["gate_loc"], out_keys=["gate_scale"]),
-        sampler("gate_logits", IndependentNormal, loc="gate_loc", scale="gate_scale"),
     )
+    normal = {"loc": "gate_loc", "scale": "gate_scale"}
+    trained = ProbabilisticTensorDictSequential(*gate, sampler("gate_logits", IndependentNormal, **normal))
+    drawn = sampler("gate_logits", NormalOfNoise, **normal, noise=noise) if noise else trained[-1]
     policy = TensorDictSequential(
-        trained,
+        *gate,
+        drawn,
         TensorDictModule(gate_activation, in_keys=["gate_logits"], out_keys=["gates"]),
         TensorDictModule(parts["primitives"], in_keys=[STATE], out_keys=list(PRIMITIVES)),
         TensorDictModule(DeterministicAction(distribution_class), in_keys=[*PRIMITIVES, "gates"], out_keys=["action"]),
@@ -184,7 +190,7 @@ def random_weights(
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
     """
-    # Paper: Gaussian weights. Here the logits are, as with exploration=weights: weights stay between 0 and 1.
+    # Paper: Gaussian weights. Here Gaussian logits, as with exploration=weights, so that weights are between 0 and 1.
     gates = gate_activation(torch.randn(num, num_primitives, generator=generator))
     composite = DeterministicAction(distribution_class)
 
@@ -193,6 +199,38 @@ def random_weights(
         return composite(loc, scale, gates)
 
     return explore
+
+
+class NormalOfNoise(IndependentNormal):
+    """A normal distribution that samples with given noise; its density is the usual one.
+
+    With noise that is correlated in time, successive samples are correlated, and each has the same marginal.
+    PPO's ratio is a ratio of marginals, as in Hollenstein et al. (2024).
+
+    Args:
+        loc: Mean, shape ``(*B, K)``.
+        scale: Standard deviation, shape ``(*B, K)``.
+        noise: Standard normal noise, shape ``(*B, K)``.
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor, noise: Tensor) -> None:
+        super().__init__(loc, scale)
+        self._noise = noise
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """Return the sample that belongs to the noise, ``(*B, K)``.
+
+        Raises:
+            ValueError: If ``sample_shape`` is not empty: the noise is for one sample.
+        """
+        if sample_shape:
+            raise ValueError(f"sample_shape={tuple(sample_shape)}: there is noise for one sample")
+        return self.base_dist.loc + self.base_dist.scale * self._noise
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """Return the sample of :meth:`rsample`, without gradients."""
+        with torch.no_grad():
+            return self.rsample(sample_shape)
 
 
 class ConstantScale(nn.Module):

@@ -3,15 +3,15 @@ r"""The option-critic baseline: options with learned terminations, and values th
 .. math::
     U(\omega, s') = (1 - \beta_\omega(s')) Q_\Omega(s', \omega) + \beta_\omega(s') V_\Omega(s')
 
-is the value of arriving in s' with the option :math:`\omega`, which is part of what the critic must be able to tell:
-it gives the values of all options and the probabilities with which they end.
+is the value of arriving in s' with the option :math:`\omega`. To compute it, the critic returns the values of all
+options and their termination probabilities.
 
 | key | content | shape |
 |---|---|---|
-| ``held_option``, ``held_steps`` | the option of the step before, and for how long it has acted | ``(*B)`` |
+| ``held_option``, ``held_steps`` | option of the previous step, and number of steps for which it has acted | ``(*B)`` |
 | ``begins``, ``option`` | whether an option begins, and which one acts | ``(*B)`` |
 | ``option_values``, ``terminations`` | Q and beta of all options | ``(*B, K)`` |
-| ``termination`` | beta of the option that acted, where it led | ``(*B)`` |
+| ``termination`` | beta of the option that acted, in the next state | ``(*B)`` |
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -61,8 +61,8 @@ def option_critic_parts(
         goal_dim: Size of the goal, ``G``.
         action_dim: Size of the action, ``A``.
         options: Makes the network of all options, from a state to means and standard deviations, from ``(S, A, K)``.
-        terminations: Makes the network of their terminations from ``(S, K)``.
-        values_cells: Hidden units of their values.
+        terminations: Makes the termination network of all options from ``(S, K)``.
+        values_cells: Hidden units of the critic.
         width: Factor on ``values_cells``.
         num_options: Number of options, ``K``.
         normaliser: Makes an input normaliser from a size.
@@ -88,8 +88,8 @@ def option_critic_actor(
 ) -> OptionActor:
     r"""Choose the option of highest value when none is held or the held one ends, and let it act.
 
-    Terminations are drawn in deterministic interaction as well: no threshold on :math:`\beta` would keep the rates at
-    which options change. Deterministic are then the choice of the option and its action.
+    Terminations stay random in deterministic interaction, because no threshold on :math:`\beta` would keep the rates at
+    which options change. Only the choice of the option and its action become deterministic.
 
     Args:
         parts: Made by :func:`option_critic_parts`.
@@ -156,24 +156,24 @@ def random_sequence(
 
 
 def begins(terminations: Tensor, held_option: Tensor, held_steps: Tensor) -> Tensor:
-    """Draw whether an option begins, ``(*B)``, bool: none is held, or the held one ends.
+    """Draw whether an option begins, ``(*B)``, bool: it does if none is held or the held one ends.
 
     Args:
         terminations: Probabilities with which options end, shape ``(*B, K)``.
-        held_option: The option of the step before, shape ``(*B)``.
-        held_steps: For how many steps it has acted, 0 if there is none, shape ``(*B)``.
+        held_option: The option of the previous step, shape ``(*B)``.
+        held_steps: Steps for which that option has acted, 0 if there is none, shape ``(*B)``.
     """
     ends = termination(terminations, held_option)
     return (held_steps == 0) | (torch.rand_like(ends) < ends)
 
 
 def termination(terminations: Tensor, option: Tensor) -> Tensor:
-    """Return from probabilities ``(*B, K)`` those of the options ``(*B)``."""
+    """Select the probabilities of the options ``(*B)`` from those of all options, ``(*B, K)``."""
     return of_option(terminations, option).squeeze(-1)
 
 
 def acting_option(loc: Tensor, scale: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation of the options ``(*B)``, each ``(*B, A)``, from all, each ``(*B, K, A)``."""
+    """Select mean and standard deviation, ``(*B, A)``, of the options ``(*B)`` from those of all, ``(*B, K, A)``."""
     index = option[..., None, None].expand(*option.shape, 1, loc.shape[-1])
     return loc.gather(-2, index).squeeze(-2), scale.gather(-2, index).squeeze(-2)
 

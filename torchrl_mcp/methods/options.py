@@ -1,4 +1,4 @@
-"""Options: policies of which one acts at a time, blind to the goal, chosen by another policy that sees it."""
+"""Options: policies that do not see the goal, one of which acts at a time, chosen by a policy that sees the goal."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ class SeparateOptions(nn.Module):
         observation_dim: Size of the state, ``S``.
         action_dim: Size of the action, ``A``.
         num_options: Number of options, ``K``.
-        policy: Makes the network of one, as of the scratch model, from ``(S, G, A)``; the goal has no features here.
+        policy: Makes the network of one option, such as the scratch model's, from ``(S, G, A)``, with ``G = 0``.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Terminations(nn.Module):
         nn.init.constant_(self.output.bias, math.log(initial / (1 - initial)))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return ``(*B, K)`` from a state ``(*B, S)``."""
+        """Return probabilities ``(*B, K)`` from a state ``(*B, S)``."""
         return self.output(self.body(observation)).float().sigmoid()
 
 
@@ -101,7 +101,7 @@ class WhereBeginning(nn.Module):
         self.scores, self.num_options = scores, num_options
 
     def forward(self, observation: Tensor, goal: Tensor, begins: Tensor) -> Tensor:
-        """Return ``(*B, K)``."""
+        """Return scores ``(*B, K)``."""
         scores = torch.zeros(*begins.shape, self.num_options, device=begins.device)
         scores[begins] = self.scores(observation[begins], goal[begins]).float()
         return scores
@@ -140,7 +140,7 @@ class RandomSequence:
 
 
 class EpsilonGreedy(Categorical):
-    r"""The policy over options that values define: the best one, or with probability :math:`\epsilon` any.
+    r"""The policy over options: the option of highest value, or with probability :math:`\epsilon` a random option.
 
     .. math:: \pi_\Omega(\omega|s, g) = (1 - \epsilon) [\omega = \arg\max Q_\Omega(s, g, \cdot)] + \epsilon / K
 
@@ -170,20 +170,20 @@ def keep_option(begins: Tensor, drawn: Tensor, held: Tensor) -> Tensor:
 
 
 def of_option(values: Tensor, option: Tensor) -> Tensor:
-    """Return from values ``(*B, K)`` those of the options ``(*B)``, or one for all, as ``(*B, 1)``."""
+    """Select the values ``(*B, 1)`` of the options, ``(*B)`` or a single one, from those of all, ``(*B, K)``."""
     return values.gather(-1, option.unsqueeze(-1).expand(*values.shape[:-1], 1))
 
 
 def option_diagnostics(option: Tensor, begins: Tensor, num_options: int) -> dict[str, Tensor]:
-    """Summarise which of the options act, and how long: have they collapsed into one, do they switch at every step?
+    """Summarise which options act and for how long: whether they collapsed into one, or switch at every step.
 
     ``usage_k`` is the share of steps in which option k acts, ``effective_options`` the exponential of the entropy of
-    these shares: 1 where one option does everything. ``begin_rate`` is the share of steps in which an option begins,
+    these shares: 1 if one option does everything. ``begin_rate`` is the share of steps in which an option begins,
     at the start of an episode or after another has ended, and ``duration`` its inverse, the mean number of steps.
 
     Args:
         option: The option that acts, shape ``(*B)``, int64.
-        begins: Whether it has been chosen in this step, shape ``(*B)``, bool.
+        begins: Whether it was chosen in this step, shape ``(*B)``, bool.
         num_options: Number of options, ``K``.
     """
     usage = option.flatten().bincount(minlength=num_options) / option.numel()

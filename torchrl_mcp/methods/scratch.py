@@ -40,7 +40,7 @@ def gaussian_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Act
 
     Args:
         parts: Made by :func:`gaussian_parts`.
-        frozen: Names of the parts that do not change in training; the policy is evaluated in full all the same.
+        frozen: Names of the parts that do not change in training; the policy is still evaluated in full.
     """
     policy = ProbabilisticTensorDictSequential(
         normalise_inputs(parts),

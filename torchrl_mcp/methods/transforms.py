@@ -11,11 +11,13 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
+from torchrl_mcp.methods.actor import NOISE
+
 
 class TransformedCharacterEnv(TransformedEnv):
     """Environments with transforms; the state of both can be set, saved and restored.
 
-    TorchRL's own class saves the transforms alone, and loses a state to reset to before it reaches the environments.
+    TorchRL's own class saves the transforms alone, and does not pass a state for a reset on to the environments.
     """
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -23,7 +25,7 @@ class TransformedCharacterEnv(TransformedEnv):
         return {"base_env": self.base_env.state_dict(), "transform": self.transform.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the state of :meth:`state_dict`."""
         self.base_env.load_state_dict(state_dict["base_env"])
         self.transform.load_state_dict(state_dict["transform"])
 
@@ -35,12 +37,13 @@ class TransformedCharacterEnv(TransformedEnv):
 
 
 class OptionMemory(Transform):
-    """A transform that shows a policy the option of the step before, ``held_option``, and how many steps it has acted.
+    """A transform that adds the previous step's option, ``held_option``, and its duration in steps, ``held_steps``.
 
-    ``held_steps`` is 0 at the beginning of an episode, where no option is held. The policy writes ``option`` and
-    whether it has chosen it in this step, ``begins``, each ``(N,)``; one that writes neither keeps what is held.
+    ``held_steps`` is 0 at the beginning of an episode, where no option is held. The policy writes ``option``, and
+    ``begins``, whether it has chosen the option in this step, each ``(N,)``. A policy that writes neither keeps the
+    held option.
 
-    The memory is part of ``state_dict``: after loading it, the next reset of all environments returns to it.
+    The memory is part of ``state_dict``: the next reset of all environments after loading returns to it.
     """
 
     def __init__(self) -> None:
@@ -53,11 +56,11 @@ class OptionMemory(Transform):
         return _with_integers(observation_spec, "held_option", "held_steps")
 
     def get_extra_state(self) -> dict[str, Tensor]:
-        """Return what is held."""
+        """Return held option and steps."""
         return {key: value.clone() for key, value in self._held.items()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Hold what :meth:`get_extra_state` gave."""
+        """Restore the state of :meth:`get_extra_state`."""
         self._held, self._restored = {key: value.clone() for key, value in state.items()}, True
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -78,14 +81,75 @@ class OptionMemory(Transform):
         return tensordict_reset.update(self.get_extra_state())
 
 
+class CorrelatedNoise(Transform):
+    r"""A transform that adds slowly changing standard normal noise, with which a policy explores.
+
+    .. math:: \epsilon_t = \rho\, \epsilon_{t-1} + \sqrt{1 - \rho^2}\, \xi_t, \quad \xi_t \sim \mathcal{N}(0, 1)
+
+    ``noise`` is ``(N, size)``, independent between environments and components. It is drawn anew at the beginning of
+    an episode, from torch's generator of the device.
+
+    The current noise is part of ``state_dict``: the next reset of all environments after loading returns to it.
+
+    Args:
+        size: Number of components.
+        correlation: Correlation :math:`\rho` of successive steps: noise lasts for about :math:`1 / (1 - \rho)` steps.
+
+    Raises:
+        ValueError: If the correlation is not at least 0 and below 1.
+
+    Reference:
+        Hollenstein et al., *Colored Noise in PPO: Improved Exploration and Performance through Correlated Action
+        Sampling*, AAAI 2024. https://arxiv.org/abs/2312.11091
+    """
+
+    def __init__(self, size: int, correlation: float) -> None:
+        super().__init__()
+        if not 0 <= correlation < 1:
+            raise ValueError(f"correlation={correlation} must be at least 0 and below 1")
+        self.size, self.correlation = size, correlation
+        self._noise = torch.empty(0)
+        self._restored = False
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add ``noise``."""
+        if not isinstance(observation_spec, Composite):
+            raise TypeError(f"the environment observes {observation_spec}, which has no names: a Composite is needed")
+        device = observation_spec.device
+        observation_spec[NOISE] = Unbounded(shape=(*observation_spec.shape, self.size), device=device)
+        return observation_spec
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Return the current noise."""
+        return {"noise": self._noise.clone()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore the state of :meth:`get_extra_state`."""
+        self._noise, self._restored = state["noise"].clone(), bool(len(state["noise"]))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        noise = tensordict[NOISE]
+        innovation = torch.randn_like(noise).mul_((1 - self.correlation**2) ** 0.5)
+        self._noise = innovation.add_(noise, alpha=self.correlation)
+        return next_tensordict.set(NOISE, self._noise)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self._restored:
+            shape, device = (*tensordict_reset.batch_size, self.size), tensordict_reset.device
+            fresh, mask = torch.randn(shape, device=device), tensordict.get("_reset", None)
+            self._noise = fresh if mask is None else torch.where(mask, fresh, self._noise)
+        self._restored = False
+        return tensordict_reset.set(NOISE, self._noise)
+
+
 class ClipAsOption(Transform):
-    """A transform that shows the reference motion of each environment as ``option``: every option imitates one clip.
+    """A transform that adds the index of the reference motion as ``option``, so that each option imitates one clip.
 
     Args:
         num_options: Number of options, and of the reference motions.
 
     Raises:
-        ValueError: If the environment has another number of reference motions, when it is attached to it.
+        ValueError: If it is attached to an environment with another number of reference motions.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
@@ -113,7 +177,7 @@ class ClipAsOption(Transform):
 
 
 def _with_integers(spec: TensorSpec, *names: str) -> TensorSpec:
-    """Return the spec with one integer per environment under each of the names."""
+    """Return the spec with an entry for each name, of one integer per environment."""
     if not isinstance(spec, Composite):
         raise TypeError(f"the environment observes {spec}, which has no names: a Composite is needed")
     for name in names:

@@ -1,4 +1,4 @@
-"""Gating networks and what their weights say."""
+"""Gating networks, and diagnostics of their weights."""
 
 from collections.abc import Sequence
 
@@ -11,8 +11,8 @@ class Gating(nn.Module):
     r"""Gate logits from state and goal: the left half of Figure 3, up to the output activation.
 
     State and goal are encoded by separate networks whose features are concatenated and processed by one more layer.
-    The activation that turns logits into weights, a sigmoid in the paper, is a module of its own, since exploration
-    over weights samples the logits before it.
+    The activation that turns logits into weights, a sigmoid in the paper, is a separate module, because
+    exploration over weights samples the logits.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -57,7 +57,7 @@ class Gating(nn.Module):
 
 
 class JointGating(nn.Module):
-    r"""Gate logits from one network over state and goal, without encoders of their own.
+    r"""Gate logits from one network over state and goal, without separate encoders.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -124,11 +124,11 @@ def scaled_linear(in_features: int, out_features: int, gain: float) -> nn.Linear
 
 
 def gate_diagnostics(gates: Tensor, saturation: float = 0.05) -> dict[str, Tensor]:
-    r"""Summarise gates ``(*B, K)`` as scalars: do the primitives share the work, does the gate still move?
+    r"""Summarise gates ``(*B, K)`` as scalars: whether primitives share the work, and whether gates are saturated.
 
     ``sum`` is :math:`\sum_k w_k`, which divides the composite variance. ``saturation`` is the fraction of gates within
     ``saturation`` of 0 or 1, where a sigmoid hardly learns. ``entropy`` (nats) and ``effective_primitives``, its
-    exponential, are those of the normalised weights. ``usage_k`` is the mean weight of primitive k.
+    exponential, describe the normalised weights. ``usage_k`` is the mean weight of primitive k.
     """
     gates = gates.detach().float().flatten(0, -2)
     share = gates / gates.sum(-1, keepdim=True).clamp_min(torch.finfo(gates.dtype).tiny)

@@ -10,10 +10,10 @@ from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 
 
 class GaussianPolicy(nn.Module):
-    r"""A network for the mean, and a covariance of its own: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
+    r"""A network for the mean, and a covariance without one: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
 
-    The standard deviation is the same in all states. The paper's is fixed; learned, the noise can shrink where it is
-    what keeps the policy from its reward.
+    The standard deviation is the same in all states. The paper fixes it; if it is learned, it can shrink when
+    noise limits the reward.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -22,7 +22,7 @@ class GaussianPolicy(nn.Module):
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
         std: Standard deviation, one for all actions or one each, in action units.
-        learned_std: Whether ``std`` is where learning begins, or fixed.
+        learned_std: Whether to learn the standard deviation, starting at ``std``, or to fix it.
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A policy network that can be given new inputs without a change of what it does."""
+"""A policy network whose output does not change when it gets new inputs."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from torchrl_mcp.modules.gaussian import state_independent_scale
 
 
 class InputInjection(nn.Linear):
-    """The weights ``(H, G)`` by which G new inputs enter H hidden units: zero at first, so that nothing changes.
+    """Weights ``(H, G)`` from G new inputs to H hidden units; they start at zero, so that the output stays the same.
 
     Args:
         in_features: Number of new inputs, ``G``.
@@ -26,12 +26,12 @@ class InputInjection(nn.Linear):
 
 
 class InjectedPolicy(nn.Module):
-    r"""The network of the scratch model, its first layer split by its inputs.
+    r"""The network of the scratch model, with separate first-layer weights for state and goal.
 
     .. math:: \mu = W_3 \operatorname{relu}(W_2 \operatorname{relu}(W_1 s + b_1 + j) + b_2) + b_3
 
     The injection :math:`j = J g` comes from :class:`InputInjection`. It is added rather than concatenated because a
-    matrix product over more columns, be they zero, rounds differently.
+    matrix product over more columns rounds differently, even if they are zero.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -39,7 +39,7 @@ class InjectedPolicy(nn.Module):
         num_cells: Hidden units, two layers or more.
         width: Factor on all numbers of hidden units.
         std: Standard deviation, one for all actions or one each, in action units.
-        learned_std: Whether ``std`` is where learning begins, or fixed.
+        learned_std: Whether to learn the standard deviation, starting at ``std``, or to fix it.
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:

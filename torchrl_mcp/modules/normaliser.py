@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 LARGEST = 1e5
-"""Of the features of a sample: no simulation that has not diverged shows more, in SI units."""
+"""Bound on the features of a sample, in SI units; only diverged simulations exceed it."""
 
 
 class RunningNormaliser(nn.Module):
@@ -21,7 +21,7 @@ class RunningNormaliser(nn.Module):
     Args:
         size: Number of input features, ``F``.
         clip: Largest absolute output, :math:`c`.
-        max_count: Samples after which the statistics stay as they are.
+        max_count: Number of samples after which the statistics no longer change.
         epsilon: Added to the variance.
 
     Raises:
@@ -57,9 +57,10 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Merge the samples ``x``, shape ``(*B, F)``, into the statistics, with a warning but for those out of bounds.
+        """Merge the samples ``x``, shape ``(*B, F)``, into the statistics.
 
-        A sample with a feature that is not finite or beyond ``LARGEST`` would leave nothing of what came before it.
+        Samples with a feature that is not finite or beyond ``LARGEST`` are left out with a warning, because a single
+        one would outweigh all earlier samples.
 
         Reference:
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.

@@ -1,4 +1,4 @@
-"""K Gaussian primitives that see the state and never the goal."""
+"""K Gaussian primitives that see the state but not the goal."""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ class Primitives(nn.Module):
     r"""K Gaussian primitives :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` on one shared trunk.
 
     The trunk is followed by one hidden layer and one linear output layer per primitive, as in Figure 3, or by the
-    linear layers alone, as in the mixture of experts. What each primitive has for itself is evaluated together with the
-    others' as batched matrix products.
+    linear layers alone, as in the mixture of experts. The separate layers of all primitives are evaluated together, as
+    batched matrix products.
 
     Args:
         observation_dim: Size of the state, ``S``.

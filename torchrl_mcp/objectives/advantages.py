@@ -9,9 +9,9 @@ from torchrl.objectives.value import GAE
 class Advantages:
     r"""GAE(:math:`\lambda`) with TD(:math:`\lambda`) value targets, bootstrapped at time limits.
 
-    The critic sees every state once. The value of a next state is that of the following sample, except where the
-    sample after it belongs to another episode or does not exist: there, after a time limit and at the end of the batch,
-    the critic evaluates the stored next observation. A terminated episode has no value beyond its end.
+    The critic sees every state once: the value of a next state is the value of the following sample. After a time limit
+    and at the end of the batch, no sample of the same episode follows, and the critic evaluates the stored next
+    observation. A terminated episode has no value beyond its end.
 
     Rewards are scaled by :math:`1 - \gamma` first, so that returns have the size of a reward and the critic's outputs
     are of order one for any discount.

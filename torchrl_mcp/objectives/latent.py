@@ -13,18 +13,18 @@ from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 
 
 class LatentPPOLoss(BoundedClipPPOLoss):
-    r"""The bounded PPO loss plus a penalty on codes that say much about the goal.
+    r"""The bounded PPO loss plus a penalty on latent codes with much information about the goal.
 
     .. math:: L + \beta \, \mathbb{E} \, D_{KL}\left[ q(w|g) \,\|\, \mathcal{N}(0, I) \right]
 
     The paper's Eq. 12 maximises return *plus* this divergence, which would reward its growth; a regulariser is
-    subtracted from the return, hence added to the loss. Eq. 12 is stated for policy and encoder together, which is
-    pre-training, but Table 11 gives one :math:`\beta` without the distinction of stages that it makes for step sizes:
-    here it acts in both, on :math:`q(w|s, g)` at transfer.
+    subtracted from the return, hence added to the loss. Eq. 12 is stated for policy and encoder together, hence for
+    pre-training, but Table 11 has one :math:`\beta` for both stages, whereas its step sizes differ by stage. Here the
+    penalty acts in both, on :math:`q(w|s, g)` at transfer.
 
     Args:
         actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
-        critic_network: The value function, or None where it learns by a loss of its own.
+        critic_network: The value function, or None if it has its own loss.
         kl_coeff: Weight of the penalty, :math:`\beta`.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
 
@@ -56,6 +56,6 @@ class LatentPPOLoss(BoundedClipPPOLoss):
         self, tensordict: TensorDictBase, params: TensorDictParams | None = None
     ) -> tuple[Tensor, Distribution, bool]:
         outcome = super()._get_cur_log_prob(tensordict, params)
-        # The networks have just written what they computed.
+        # The networks have just written their outputs.
         self._encoding = [tensordict[key] for key in ENCODING]
         return outcome

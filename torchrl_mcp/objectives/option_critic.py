@@ -1,4 +1,4 @@
-"""What the option-critic estimates from trajectories, and what it minimises."""
+"""Estimates of the option-critic from trajectories, and its losses."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,15 +24,14 @@ class OptionAdvantages:
         A_\Omega(s', \omega) = Q_\Omega(s', \omega) - V_\Omega(s') \\
         V_\Omega(s) &= \sum_\omega \pi_\Omega(\omega|s) Q_\Omega(s, \omega)
 
-    Actions are judged by :math:`A_t`, values regress to :math:`Q_\Omega(s_t, \omega_t) + A_t`, and the termination of
-    an option in the state where it led is judged by :math:`A_\Omega(s_{t+1}, \omega_t) + \xi`. With
-    :math:`\lambda = 0` these are the one-step estimates of Bacon et al. An episode that terminated has no value beyond
-    its end and no option to end; one that is cut off by a time limit or the end of the batch goes on.
+    :math:`A_t` is the advantage of actions, the target of values is :math:`Q_\Omega(s_t, \omega_t) + A_t`, and
+    :math:`A_\Omega(s_{t+1}, \omega_t) + \xi` is the advantage of terminations. With :math:`\lambda = 0` these are the
+    one-step estimates of Bacon et al. A terminated episode has no value and no option beyond its end; one cut off by a
+    time limit or the end of the batch is bootstrapped.
 
     Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`, so that values have the
-    size of a reward. So has the termination advantage with ``regret_per_step``: :math:`\xi` is then what the option to
-    change is worth, as a share of the reward of a step. Else it is in units of returns, :math:`1 / (1 - \gamma)` times
-    as large.
+    size of a reward. With ``regret_per_step``, the termination advantage has that size as well, and :math:`\xi` is a
+    share of the reward of a step. Otherwise both are in units of returns, :math:`1 / (1 - \gamma)` times as large.
 
     Args:
         critic: From ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
@@ -125,7 +124,7 @@ class OptionCriticLoss(LossModule):
     with :math:`\rho = \pi_\omega(a|s) / \pi_\omega^{\mathrm{old}}(a|s)`. Samples that are used once have
     :math:`\rho = 1`, and the gradients of the first three terms are those of the intra-option policy gradient theorem,
     of the termination gradient theorem and of intra-option Q-learning; the clipped ratio lets samples be used several
-    times. Where the options are frozen, the third term is all that there is.
+    times. If the options are frozen, only the third term remains.
 
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
@@ -172,7 +171,7 @@ class OptionCriticLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """Whether parameters are held apart from the networks: they are not."""
+        """False: the parameters stay in the networks."""
         return False
 
     @property
@@ -185,7 +184,7 @@ class OptionCriticLoss(LossModule):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Keys of what the loss returns."""
+        """Keys of the terms that the loss returns."""
         critic = [] if self.critic_network is None else ["loss_critic"]
         if not self._learns_options():
             return critic
@@ -194,7 +193,7 @@ class OptionCriticLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the terms of the loss, and what they say of the update, as scalars."""
+        """Return the terms of the loss and statistics of the update, as scalars."""
         terms = self._critic_losses(tensordict)
         if self._learns_options():
             terms |= self._option_losses(tensordict)
@@ -234,7 +233,7 @@ class OptionCriticLoss(LossModule):
 
 
 def _update_report(log_ratio: Tensor, clip_epsilon: float) -> dict[str, Tensor]:
-    """How far the policy has gone from the one that drew the samples, as TorchRL's PPO loss tells it."""
+    """Compare the policy with the one that drew the samples, by the same statistics as TorchRL's PPO loss."""
     ratio = log_ratio.exp()
     return {
         "kl_approx": -log_ratio.mean(),

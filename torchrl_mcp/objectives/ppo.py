@@ -14,11 +14,11 @@ class BoundedClipPPOLoss(ClipPPOLoss):
 
     .. math:: L = L^{\mathrm{clip}} + c \, \mathbb{E} \sum_j \max(0, |\mu_j| - b)^2
 
-    The environment clips what leaves the bounds, so without the penalty nothing pulls such means back.
+    The environment clips actions to the bounds, so without the penalty nothing pulls such means back.
 
     Args:
         actor_network: The policy.
-        critic_network: The value function, or None where it learns by a loss of its own.
+        critic_network: The value function, or None if it has its own loss.
         bound_coeff: Weight of the penalty, :math:`c`.
         bound: Largest absolute mean action, :math:`b`.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.

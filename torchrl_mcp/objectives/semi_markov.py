@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class SemiMarkovAdvantages:
-    r"""GAE(:math:`\lambda`) and TD(:math:`\lambda`) targets for choices, from the steps that they took.
+    r"""GAE(:math:`\lambda`) and TD(:math:`\lambda`) targets for choices that last several steps.
 
     A choice in state s that lasts k steps, the last of which leads to s', has the advantage
 
@@ -15,10 +15,10 @@ class SemiMarkovAdvantages:
         A = \sum_{i=0}^{k-1} \gamma^i r_i + \gamma^k V(s') - V(s) + \gamma^k \lambda A'
 
     where :math:`A'` is the advantage of the choice that follows. A terminated episode has no value beyond its end.
-    After a time limit and at the end of the batch no choice follows, and V of the state that was reached counts,
-    whether or not the choice would have lasted longer; a batch should be long against a choice.
+    After a time limit and at the end of the batch no choice follows: V of the last state is used, even if the choice
+    would have lasted longer. A batch should be much longer than a choice.
 
-    Steps before the first choice of a batch belong to one of the batch before, and teach nothing.
+    Steps before the first choice of a batch belong to a choice of the batch before, and are not used.
 
     Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`.
 
@@ -43,7 +43,7 @@ class SemiMarkovAdvantages:
         """Return the C choices of trajectories ``(N, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
 
         Raises:
-            ValueError: If there are none.
+            ValueError: If the trajectories hold no choice.
         """
         begins = batch["begins"]
         if not begins.any():

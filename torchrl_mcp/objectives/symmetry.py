@@ -1,4 +1,4 @@
-"""Mirror images in learning: a character that is symmetric may walk its walks with left and right exchanged."""
+"""Left-right symmetry in learning: a symmetric character can walk with left and right exchanged."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,10 +12,10 @@ from torchrl_mcp.methods.options import OptionActor
 
 
 class MirroredSamples:
-    """Advantages of samples of which half, drawn anew in every batch, are replaced by their mirror images.
+    """Advantages of samples, with a random half of every batch replaced by mirror images.
 
     The mirror image of a sample has the mirrored state, goal and action, and the same advantage. Its log-probability is
-    that of the policy of now, so that the first ratio of PPO is one. Samples are as many as before, and cost as much.
+    computed with the current policy, so that the first ratio of PPO is one. The number of samples stays the same.
 
     Args:
         advantages: Estimates advantages of trajectories ``(N, T)``.
@@ -74,7 +74,7 @@ class SymmetryLoss(nn.Module):
         super().__init__()
         _require_actions(actor)
         self.loss, self.actor, self.mirrors, self.coeff = loss, actor, mirrors, coeff
-        # What is drawn, such as the noise of a latent variable, is the same on both sides: only `trained` reads it.
+        # Random keys, such as the noise of a latent variable, are the same on both sides: only `trained` reads them.
         self._network: Any = actor.trained if actor.drawn else actor.policy
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""What a value function minimises."""
+"""The loss of a value function."""
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -24,7 +24,7 @@ class ValueLoss(nn.Module):
         self.critic_network, self.coeff = critic_network, coeff
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_critic`` of samples ``(B,)``, and the share of the targets' ``explained_variance``."""
+        """Return ``loss_critic`` of samples ``(B,)``, and the ``explained_variance`` of the targets as a share."""
         target = tensordict["value_target"]
         residual = target - self._values(tensordict)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Comparison of runs: cells of seeds that may be averaged, their differences, and the paper's numbers."""
+"""Comparison of runs: groups of seeds to average, their differences, and the paper's numbers."""
 
 import math
 from collections import defaultdict
@@ -16,20 +16,20 @@ Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
 
 DEFAULT = "default"
-"""Value of an argument that no setting of a run names."""
+"""Value of an argument that a run's configuration does not set."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Runs that differ in their seeds alone, as far as they tell.
+    """Runs that differ only in their seeds, according to their configurations.
 
     Attributes:
         place: Task and character.
         stage: ``pretrain`` or ``transfer``.
         method: Name of the method.
-        settings: What tells it from other cells of the same place, stage and method.
-        choices: :func:`choices` of its runs.
-        runs: Ordered by seed.
+        settings: Settings that differ from other cells of the same place, stage and method.
+        choices: :func:`choices` of the runs.
+        runs: The runs, ordered by seed.
     """
 
     place: tuple[str, str]
@@ -41,7 +41,7 @@ class Cell:
 
     @cached_property
     def complete(self) -> list[Run]:
-        """Runs that have taken all their steps and were evaluated; the others are in no mean."""
+        """Runs that are trained and evaluated; means leave out the others."""
         return [run for run in self.runs if run.state == "complete"]
 
     @property
@@ -51,7 +51,7 @@ class Cell:
 
     @property
     def is_standard(self) -> bool:
-        """Whether its settings are those by which the method is known: it is no variant."""
+        """Whether the settings are the method's standard ones, so that the cell is no variant."""
         return all(self.choices[name] == value for name, value in self.runs[0].standard.items())
 
     @property
@@ -65,7 +65,7 @@ class Cell:
         return [run.evaluation[mode]["normalised_return"] for run in self.complete]
 
     def mean(self, mode: str = "deterministic") -> Estimate | None:
-        """Mean over seeds with its interval; of a single seed, with the interval over its episodes."""
+        """Mean over seeds with its interval; for a single seed, the interval is over its episodes."""
         if len(self.complete) == 1:
             numbers = self.complete[0].evaluation[mode]
             return Estimate(numbers["normalised_return"], *numbers["interval"])
@@ -73,7 +73,7 @@ class Cell:
 
     @property
     def spread(self) -> str:
-        """What to call the interval of its mean: a bootstrap of two or three seeds gives no more than their range."""
+        """Name of the mean's interval: a bootstrap of two or three seeds is their range."""
         return "range " if len(self.complete) in (2, 3) else ""
 
     def deviation(self, mode: str = "deterministic") -> float:
@@ -88,7 +88,7 @@ class Cell:
 
     @property
     def seconds(self) -> float:
-        """Mean wall time of the complete runs, or of all so far where none is."""
+        """Mean wall time of the complete runs, or of all runs if none is complete."""
         runs = self.complete or self.runs
         return sum(run.seconds for run in runs) / len(runs)
 
@@ -100,12 +100,12 @@ class Cell:
 
     @property
     def commits(self) -> list[str]:
-        """Commits of its runs."""
+        """Commits of the runs."""
         return list(dict.fromkeys(run.commit for run in self.runs))
 
     @property
     def standing(self) -> str:
-        """How far its runs have come, of a cell without a complete one."""
+        """Progress of the runs, for a cell without a complete one."""
         if any(run.state == "unfinished" for run in self.runs):
             return f"{sum(run.progress for run in self.runs) / len(self.runs):.0%} trained"
         return self.runs[0].state
@@ -117,17 +117,17 @@ class Cell:
 
     @property
     def reach(self) -> dict[str, float]:
-        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes, where the task says."""
+        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes, if the task has them."""
         return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader should know before trusting its numbers."""
+        """Remarks on the reliability of the numbers."""
         standings = _grouped((run for run in self.runs if run.state != "complete"), _standing)
         seeds = [run.seed for run in self.runs]
         return [
             *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
-            *(["one seed, so that the interval is over its episodes"] if len(self.complete) == 1 else []),
+            *(["one seed: the interval is over its episodes"] if len(self.complete) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(f"mixed {found}" for found in _mixed("evaluations", map(_protocol, self.complete))),
             *(f"trained with practice={self.choices['practice']}: {used}" for used in self.runs[0].practice),
@@ -139,8 +139,8 @@ class Ablation:
     """Cells of one method that differ in one setting.
 
     Attributes:
-        setting: Its name.
-        cells: In the order of its values.
+        setting: Name of the setting.
+        cells: The cells, ordered by the value of the setting.
     """
 
     setting: str
@@ -148,9 +148,9 @@ class Ablation:
 
 
 def choices(run: Run) -> dict[str, Any]:
-    """Settings that have a name of their own in the paper or the command line, and those by which the method is known.
+    """Return settings that the paper or the command line names, and the method's standard settings.
 
-    They are None where a method has none such.
+    Settings that a method lacks are None.
     """
     settings = run.settings
     transfers = run.stage == "transfer" and "primitives" in settings.get("transfer.keep", ())
@@ -173,9 +173,8 @@ def choices(run: Run) -> dict[str, Any]:
 def cells(runs: Iterable[Run]) -> list[Cell]:
     """Group runs into cells, in the paper's order of tasks, stages and methods.
 
-    Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or, where these are
-    alike, any other value of their configuration that :mod:`~torchrl_mcp.runs.identity` counts. Commits do not part
-    them: a cell remarks on them.
+    Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or any other
+    setting that :mod:`~torchrl_mcp.runs.identity` counts. Runs of different commits may share a cell.
     """
     found = []
     for alike in _grouped(runs, lambda run: (run.place, run.stage, run.method)).values():
@@ -186,12 +185,12 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
 
 
 def methods(cells: Iterable[Cell]) -> dict[str, str]:
-    """Return the titles of methods by their names: those of Table 2 in its order, then others by the alphabet."""
+    """Return the titles of methods by name: first in the order of Table 2, then alphabetically."""
     return {cell.method: cell.title for cell in sorted(cells, key=lambda cell: _rank(cell.method, METHODS))}
 
 
 def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
-    """Return where a method was trained with several values of a choice, all other settings alike."""
+    """Return the groups of cells that differ only in one of the :func:`choices`."""
 
     def rest(cell: Cell) -> Hashable:
         others = _frozen({k: v for k, v in {**cell.choices, **cell.settings}.items() if k != setting})
@@ -204,7 +203,7 @@ def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
 
 
 def caveats(cells: Sequence[Cell]) -> list[str]:
-    """Return what differs between cells beside their methods, and may be why they differ in their results."""
+    """Return differences between cells other than their methods, which may affect their results."""
     runs = [run for cell in cells for run in cell.runs]
     steps = {
         title: sorted({run.total_frames for run in group})
@@ -215,7 +214,7 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
         *_mixed("commits", (run.commit for run in runs)),
         *_mixed("evaluations", (_protocol(run) for run in runs if run.state == "complete")),
         *(
-            f"steps of {title}: {', '.join(f'{total:,}' for total in totals)}"
+            f"numbers of steps of {title}: {', '.join(f'{total:,}' for total in totals)}"
             for title, totals in steps.items()
             if len(totals) > 1
         ),
@@ -225,7 +224,8 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
 def over_tasks(cells: Iterable[Cell]) -> tuple[list[tuple[str, str]], dict[str, Estimate]]:
     """Return the tasks of Table 2 in which all methods were evaluated, and each method's interquartile mean over them.
 
-    A method with several cells in a task has no single result there. Fewer than two methods or tasks compare nothing.
+    A method with several cells in a task counts as not evaluated there. Both are empty for fewer than two methods or
+    tasks.
     """
     scores: dict[str, dict[tuple[str, str], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     for cell in cells:
@@ -239,7 +239,7 @@ def over_tasks(cells: Iterable[Cell]) -> tuple[list[tuple[str, str]], dict[str, 
 
 
 def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
-    """Cells of runs with the same choices, of which ``telling`` are the names of those that tell them from others."""
+    """Cells of runs with the same choices; ``telling`` are the names of choices that differ from other runs."""
     others = _varying([_learned(run) for run in runs])
     found = []
     for alike in _grouped(runs, lambda run: _frozen(_learned(run), others)).values():
@@ -252,21 +252,21 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
 
 
 def _learned(run: Run) -> dict[str, Any]:
-    """What of a run's configuration may change what it learns."""
+    """Settings of a run that may affect learning."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
     ignored = UNLEARNT | {other_stage}
     return {name: value for name, value in run.settings.items() if not is_among(name, ignored)}
 
 
 def _varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Names with more than one value. What some lack counts where it is an argument, which has a default then."""
+    """Names with more than one value. A missing setting has its default if it is an argument; others are ignored."""
     names = dict.fromkeys(name for one in settings for name in one)
     shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
     return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
 
 
 def _target(name: str) -> str:
-    """Name of the setting that says of what a setting would be an argument."""
+    """Name of the setting with the class or function of which a setting is an argument."""
     return f"{name.rpartition('.')[0]}._target_"
 
 

@@ -34,9 +34,9 @@ def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime)
     """Return the report by file name, ``report.html`` and ``report.md``.
 
     Args:
-        runs: Runs, in whatever state.
+        runs: Runs in any state.
         damaged: Folders that could not be read.
-        moment: When they were read.
+        moment: Time of reading.
     """
     environment = Environment(
         loader=PackageLoader("torchrl_mcp.report"),
@@ -51,7 +51,7 @@ def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime)
 
 
 def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
-    """What the templates show."""
+    """Return the variables of the templates."""
     found = cells(runs)
     stages = {stage: [cell for cell in found if cell.stage == stage] for stage in ("transfer", "pretrain")}
     names = (f"plot-{number}" for number in count(1))
@@ -120,4 +120,4 @@ FILTERS = {
     "place": place_title,
     "cell": lambda text: str(text).replace("|", r"\|").replace("\n", " "),
 }
-"""Of the templates. ``cell`` is for Markdown's tables."""
+"""Filters of the templates. ``cell`` is for Markdown's tables."""

@@ -1,4 +1,4 @@
-"""The paper's results, which the report shows beside ours.
+"""The paper's results, for comparison in the report.
 
 Reference:
     Peng et al., "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies", NeurIPS

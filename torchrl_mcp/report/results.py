@@ -28,10 +28,10 @@ MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
 
 SAID = {"choices": str, "machine": str | int}
-"""What the groups of a run's provenance hold."""
+"""Types of the values in the groups of a run's provenance."""
 
 MOST_FRAMES = 1e15
-"""More than anybody trains."""
+"""Upper bound on environment steps, above any training."""
 
 REQUIRED = {
     "task.name": str,
@@ -45,7 +45,7 @@ REQUIRED = {
 
 @dataclass(frozen=True)
 class Damaged:
-    """A folder that cannot be read, and why."""
+    """A folder that cannot be read, and the reason."""
 
     path: Path
     reason: str
@@ -59,11 +59,11 @@ class Run:
         path: The folder.
         settings: The resolved configuration, flat: ``{"method.name": "mcp", "training.total_frames": 1500000, ...}``.
         frames: Environment steps taken so far.
-        seconds: Wall time of them.
+        seconds: Wall time of these steps.
         has_episodes: Whether an episode has ended, so that there is a learning curve.
         evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
-        provenance: Commit, choices and machine of its beginning; empty of older runs.
-        fault: What is wrong with its files, or None.
+        provenance: Commit, choices and machine at the start; empty for older runs.
+        fault: Error in the run's files, or None.
     """
 
     path: Path
@@ -92,7 +92,7 @@ class Run:
 
     @property
     def standard(self) -> dict[str, Any]:
-        """Settings by which the method is known."""
+        """Standard settings of the method."""
         prefix = "method.standard."
         return {name.removeprefix(prefix): x for name, x in self.settings.items() if name.startswith(prefix)}
 
@@ -108,23 +108,23 @@ class Run:
 
     @property
     def total_frames(self) -> int:
-        """Environment steps that it is to take."""
+        """Environment steps of the whole run."""
         return self.settings["training.total_frames"]
 
     @property
     def preset(self) -> str:
-        """Preset of its settings: ``demo`` of the demonstration's runs, ``unknown`` of others that did not note it."""
+        """Preset of the settings: ``demo`` for runs of the demonstration, ``unknown`` if not recorded."""
         is_demo = any(name.startswith("demo.") for name in self.settings)
         return self.provenance.get("choices", {}).get("preset", "demo" if is_demo else "unknown")
 
     @property
     def commit(self) -> str:
-        """Commit of the library that it began with, ``unknown`` of runs that did not note it."""
+        """Commit of the library at the start, ``unknown`` if not recorded."""
         return self.provenance.get("commit") or "unknown"
 
     @property
     def practice(self) -> list[str]:
-        """Settings of the environment in transfer that are not those of the evaluation: a line, or none."""
+        """Settings of the environment that differ between transfer and evaluation, as one line or none."""
         if self.stage != "transfer":
             return []
         trained, evaluated = (
@@ -137,7 +137,7 @@ class Run:
 
     @property
     def progress(self) -> float:
-        """Share of its steps that it has taken, at most 1."""
+        """Share of the steps taken so far, at most 1."""
         return min(1.0, self.frames / self.total_frames)
 
     @property
@@ -151,16 +151,16 @@ class Run:
 
 
 def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
-    """Read the run folders among ``paths`` and at any depth in them, each once, in the order of their names.
+    """Read the run folders in ``paths`` at any depth, each once, ordered by name.
 
     Raises:
-        ValueError: If a path does not exist or holds no run.
+        ValueError: If a path does not exist or contains no run.
     """
     folders: dict[Path, Path] = {}
     for path in paths:
         found = sorted(_run_folders(path))
         if not found:
-            raise ValueError(f"{path} holds no run: give folders with {CONFIG} and {METRICS}, or folders of such")
+            raise ValueError(f"{path} holds no run: give run folders, with {CONFIG} and {METRICS}, or folders of them")
         for folder in found:
             folders.setdefault(folder.resolve(), folder)
     outcomes = [read_run(folder) for folder in folders.values()]
@@ -169,7 +169,7 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
 
 
 def read_run(folder: Path) -> Run | Damaged:
-    """Read a run folder; what is damaged is told, not raised."""
+    """Read a run folder; errors in its files are returned, not raised."""
     try:
         settings = dict(_leaves(read_config(folder / CONFIG)))
     except FileNotFoundError:
@@ -179,8 +179,8 @@ def read_run(folder: Path) -> Run | Damaged:
     if unfit := [name for name, kind in REQUIRED.items() if not isinstance(settings.get(name), kind)]:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
     if (total := settings["training.total_frames"]) < 1:
-        return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which is no training")
-    if "method.title" not in settings:  # the run is older than what methods tell about themselves
+        return Damaged(folder, f"{CONFIG} has training.total_frames={total}: it must be at least 1")
+    if "method.title" not in settings:  # an older run, without the method's title and standard settings
         settings = dict(_leaves(_about(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
@@ -214,7 +214,7 @@ def _progress(folder: Path) -> dict[str, Any]:
     if not rows:
         return {}
     if not all(0 <= row["frames"] < MOST_FRAMES for row in rows):
-        raise ValueError(f"its frames are no numbers of steps, below {MOST_FRAMES:.0e}")
+        raise ValueError(f"its frames are not numbers of steps below {MOST_FRAMES:.0e}")
     return {
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],
@@ -235,12 +235,12 @@ def _evaluation(folder: Path) -> dict[str, Any]:
             if not math.isfinite(value):
                 raise ValueError(f"the {mode} normalised return is {value}")
         if wrong := [name for name, value in numbers.items() if not _is_evaluated(name, value)]:
-            raise ValueError(f"its {mode} {', '.join(wrong)} cannot be that")
+            raise ValueError(f"values of a wrong type in {mode}: {', '.join(wrong)}")
     return {"evaluation": content}
 
 
 def _is_evaluated(name: str, value: Any) -> bool:
-    """Tell whether an evaluation may say this of a quantity."""
+    """Return whether a quantity of an evaluation has a valid type."""
     if name == "interval":
         return isinstance(value, list) and len(value) == 2
     if name in ("metrics", "diagnostics", "reach"):
@@ -268,7 +268,7 @@ def _line(error: Exception) -> str:
 
 @cache
 def _about(method: str) -> dict[str, Any]:
-    """Return what the library's method of a name tells about itself, or nothing of a method that it does not have."""
+    """Return the group ``method`` of the library's configuration for a method, empty for unknown methods."""
     known = files("torchrl_mcp.conf").joinpath("method").iterdir()
     if f"{method}.yaml" not in {file.name for file in known}:
         return {}

@@ -16,19 +16,19 @@ LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS
 PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
-"""Kinds of lines of matplotlib, and their like in SVG."""
+"""Line styles of matplotlib, and their equivalents in SVG."""
 
 ABLATIONS = {
     "num_primitives": (
         "Number of primitives",
-        "Table 4 of the paper, where the humanoid dribbles with 4, 8, 16 and 32.",
+        "Table 4 of the paper: the humanoid dribbles with 4, 8, 16 and 32 primitives.",
     ),
-    "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper, where both fare alike on most tasks."),
-    "mixer": ("Mixer", "Primitives composed by Eq. 3, multiplicative, or by Eq. 1, additive."),
-    "exploration": ("Exploration", "Over actions, as in Eq. 4, or over the weights of primitives, as in Section 5.3."),
+    "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper: similar returns on most tasks."),
+    "mixer": ("Mixer", "Multiplicative composition of primitives (Eq. 3), or additive (Eq. 1)."),
+    "exploration": ("Exploration", "Over actions (Eq. 4), or over the weights of primitives (Section 5.3)."),
     "practice": (
         "Practice",
-        "What training used beside the episodes that the paper prints; the evaluation is the same.",
+        "Episodes and rewards of training that differ from the paper's. Evaluations have the paper's.",
     ),
 }
 
@@ -64,7 +64,7 @@ DIAGNOSTICS = {
 
 @dataclass(frozen=True)
 class Row:
-    """A cell with its name in a table, and what tells it from others of that name."""
+    """A cell with its name in a table, and its differences from cells of the same name."""
 
     cell: Cell
     name: str
@@ -72,13 +72,13 @@ class Row:
 
     @property
     def label(self) -> str:
-        """Both in one line."""
+        """Name and variant in one line."""
         return f"{self.name}, {self.variant}" if self.variant else self.name
 
 
 @dataclass(frozen=True)
 class Line:
-    """An entry of a legend: its label and how the line is drawn, in CSS."""
+    """An entry of a legend: label, and style of the line in CSS."""
 
     label: str
     colour: str
@@ -87,7 +87,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Learning curves, their legend, and the labels of rows in which no episode has ended yet."""
+    """Learning curves, their legend, and the labels of rows without a finished episode."""
 
     svg: str
     lines: Sequence[Line]
@@ -96,7 +96,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Section:
-    """Cells that are compared with each other, which are a ``kind`` of thing."""
+    """Cells to compare with each other; ``kind`` is the heading of their column."""
 
     title: str
     rows: Sequence[Row]
@@ -105,12 +105,12 @@ class Section:
 
     @property
     def caveats(self) -> list[str]:
-        """What else differs between the cells."""
+        """Other differences between the cells."""
         return caveats([row.cell for row in self.rows])
 
     @property
     def remarks(self) -> dict[str, list[str]]:
-        """Labels of the rows by what is remarked of them."""
+        """Labels of the rows by remark."""
         found: dict[str, list[str]] = {}
         for row in self.rows:
             for remark in row.cell.remarks:
@@ -124,16 +124,16 @@ class Section:
 
     @property
     def has_reported(self) -> bool:
-        """Whether the paper has a figure for one of them."""
+        """Whether the paper has a number for one of the cells."""
         return any(row.cell.reported for row in self.rows)
 
     @property
     def has_reach(self) -> bool:
-        """Whether one of them has a place between standing still and an ideal player."""
+        """Whether one of the cells has a place between standing still and an ideal player."""
         return any(row.cell.reach for row in self.rows)
 
     def is_best(self, cell: Cell, mode: str) -> bool:
-        """Whether a cell has the highest mean of at least two."""
+        """Whether a cell has the highest of at least two means."""
         means = [estimate.value for row in self.rows if (estimate := row.cell.mean(mode))]
         own = cell.mean(mode)
         return own is not None and len(means) > 1 and own.value == max(means)
@@ -161,7 +161,7 @@ def method_colours(cells: Sequence[Cell]) -> dict[str, str]:
 
 
 def row(cell: Cell) -> Row:
-    """Return a cell under the title of its method; settings by which the method is known go without saying."""
+    """Return a cell under the title of its method, without the method's standard settings."""
     standard = cell.runs[0].standard
     telling = {name: value for name, value in cell.settings.items() if name not in standard or value != standard[name]}
     words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in telling.items())
@@ -171,7 +171,7 @@ def row(cell: Cell) -> Row:
 def task_sections(cells: Sequence[Cell], names: Iterator[str], palette: Mapping[str, str]) -> list[Section]:
     """Return a section per task and character, as in Figures 4 and 9.
 
-    The table has all cells; the plot leaves out those that an ablation shows.
+    The table has all cells; the plot leaves out the cells of ablations.
 
     Args:
         cells: Cells of one stage.
@@ -189,7 +189,7 @@ def task_sections(cells: Sequence[Cell], names: Iterator[str], palette: Mapping[
 
 
 def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapter]:
-    """Return what cells say of the ablations, those of which there is something to compare."""
+    """Return the ablations for which there are cells to compare."""
     chapters = []
     for setting, (title, explanation) in ABLATIONS.items():
         sections = []
@@ -206,7 +206,7 @@ def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapt
 
 
 def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return what is known of gates and options, a row per cell that has any."""
+    """Return the diagnostics of gates and options, with a row per cell that has them."""
     tables = []
     for group, (title, columns) in DIAGNOSTICS.items():
         rows = [
@@ -225,13 +225,13 @@ def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], name: str) -> Plot | None:
-    """Draw the learning curves of rows, or return None where no episode has ended.
+    """Draw the learning curves of rows, or return None if no episode has ended.
 
     Args:
-        title: What they share.
+        title: Common title of the rows.
         rows: The rows.
-        styles: ``color`` and ``linestyle`` of each.
-        name: Name of the plot, of which a page has one.
+        styles: ``color`` and ``linestyle`` of each row.
+        name: Name of the plot, unique on the page.
     """
     groups = [
         ([run.path for run in r.cell.runs if run.has_episodes], r.label, s) for r, s in zip(rows, styles, strict=True)
@@ -249,7 +249,7 @@ def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], n
 
 
 def _styles(rows: Sequence[Row], palette: Mapping[str, str]) -> Iterator[dict[str, str]]:
-    """A colour per method; another kind of line for each variant, and for a method whose colour is taken."""
+    """Yield a colour per method, with another line style for each variant, and for methods of the same colour."""
     kinds: dict[str, Iterator[str]] = {}
     for r in rows:
         colour = palette[r.cell.method]

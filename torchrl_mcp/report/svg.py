@@ -12,20 +12,19 @@ SVG = "http://www.w3.org/2000/svg"
 XLINK = "http://www.w3.org/1999/xlink"
 
 LEFT_OUT = {f"{{{SVG}}}metadata", f"{{{SVG}}}style"}
-"""Elements that would say the same in every figure, or speak to the whole page."""
+"""Elements that are the same in every figure, or affect the whole page."""
 
 
 def inline_svg(figure: Figure, name: str, description: str, colours: Mapping[str, str]) -> str:
     """Return a figure as an ``<svg>`` element for HTML, as wide as its container.
 
-    Text stays text. Of the identifiers those remain that something refers to, which ``name`` keeps apart from those of
-    other figures on the page.
+    Text stays text. Identifiers without references are removed; the others are unique on the page because of ``name``.
 
     Args:
         figure: The figure.
-        name: Its name, of which a page has one.
-        description: What it shows, for those who do not see it.
-        colours: What to put for colours of the figure, in CSS: ``{"#0072B2": "var(--line-1)"}``.
+        name: Name of the figure, unique on the page.
+        description: Description for screen readers.
+        colours: CSS colours by colours of the figure: ``{"#0072B2": "var(--line-1)"}``.
     """
     buffer = io.StringIO()
     with rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):

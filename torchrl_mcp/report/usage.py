@@ -1,4 +1,4 @@
-"""Usage of gates and options in evaluations: do the primitives share the work?"""
+"""Usage of gates and options in evaluations: whether the primitives share the work."""
 
 import math
 
@@ -8,32 +8,35 @@ from torchrl_mcp.report.comparison import Cell
 from torchrl_mcp.report.results import Run
 
 WIDE_OPEN = 0.95
-"""Mean weight from which the gates no longer choose: the composite is then the product of all primitives."""
+"""Mean weight above which the gates no longer select: the composite is then the product of all primitives."""
 
 RESTLESS = 0.9
-"""Share of steps in which an option begins, from which options are no more than actions."""
+"""Share of steps in which an option begins, above which options last hardly longer than actions."""
+
+PARTS = {"gates": "primitive", "options": "option"}
+"""Name of the parts that share the work, by group of diagnostics."""
 
 
 def diagnostics(cell: Cell, group: str) -> dict[str, float]:
-    """Means over seeds of the diagnostics of ``gates`` or ``options``, but for :func:`usage`; empty without any."""
+    """Means over seeds of the diagnostics of ``gates`` or ``options``, except :func:`usage`; empty without any."""
     return shared_means([_diagnostics(run, group) for run in cell.complete], "usage_")
 
 
 def usage(run: Run, group: str) -> list[float]:
-    """How much each primitive is used: of ``gates`` the mean weight, of ``options`` the share of steps."""
+    """Usage of each primitive: the mean weight for ``gates``, the share of steps for ``options``."""
     found = _diagnostics(run, group)
     return [found[f"usage_{index}"] for index in range(sum(name.startswith("usage_") for name in found))]
 
 
 def verdict(run: Run, group: str) -> str | None:
-    """What is wrong with the ``gates`` or ``options`` of a run, if anything is."""
+    """Return a problem of the ``gates`` or ``options`` of a run, or None."""
     found = _diagnostics(run, group)
     if min(found.get("effective_primitives", math.inf), found.get("effective_options", math.inf)) < COLLAPSED:
-        return "one does almost everything"
+        return f"one {PARTS[group]} does almost all the work"
     if found.get("sum", 0.0) > WIDE_OPEN * len(usage(run, group)):
-        return "all gates are open almost always"
+        return "the gates are almost fully open, so they hardly select"
     if found.get("begin_rate", 0.0) > RESTLESS:
-        return "another begins at almost every step"
+        return "a new option begins at almost every step"
     return None
 
 

@@ -1,1 +1,1 @@
-"""Runs: built from configurations, trained in folders of their own, alone or as benchmarks of many."""
+"""Runs: built from configurations and trained in a folder each, singly or as benchmarks."""

@@ -1,9 +1,9 @@
-"""Benchmarks: many runs of ``torchrl-mcp-train`` by Hydra's launchers, pre-training before what transfers from it.
+"""Benchmarks: many runs of ``torchrl-mcp-train`` by Hydra's launchers, pre-training before transfer.
 
-A benchmark is a file of rows and settings, which are expanded to runs and handed to the configured launcher in batches
-of all that is ready: first pre-training and what needs none, then transfer (Hydra's own sweepers know of no run that
-waits for another). A run is its folder, whose configuration says what it is. Re-running a benchmark skips finished
-runs, resumes the others, and refuses a folder of other settings.
+A benchmark file has rows and settings, which are expanded to runs. The configured launcher starts them in two batches:
+first pre-training and runs without it, then transfer (Hydra's own sweepers cannot make one run wait for another). The
+configuration in a run's folder identifies it. Re-running a benchmark skips finished runs, resumes the others, and
+refuses folders with other settings.
 """
 
 import sys
@@ -42,9 +42,9 @@ class Job:
     """A run of a benchmark.
 
     Attributes:
-        folder: Its run folder.
-        overrides: Its command line.
-        config: Its configuration.
+        folder: Run folder.
+        overrides: Command-line overrides.
+        config: Resolved configuration.
         needs: Folder of the pre-training that must be complete first, if any.
     """
 
@@ -54,13 +54,13 @@ class Job:
     needs: Path | None = None
 
     def after(self, pretraining: Path) -> "Job":
-        """Return the job as it transfers from the pre-training in a folder."""
+        """Return the job with transfer from the pre-training in a folder."""
         config = {**self.config, "pretrained": str(pretraining)}
         return Job(self.folder, [*self.overrides, f"pretrained={pretraining}"], config, pretraining)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run what is not complete of the benchmark that the command line names, and name what has failed.
+    """Run the incomplete runs of the benchmark on the command line, and list those that fail.
 
     Raises:
         ValueError: If the arguments fit no row, or a folder holds a run of other settings.
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str]) -> None:
         context = HydraContext(config_loader=hydra.config_loader, callbacks=cast("Any", Callback()))
         jobs = plan(master, hydra.config_loader)
         if conflicts := [line for job in jobs if (line := conflict(job))]:
-            raise ValueError("\n".join(["nothing was started, for there are runs of other settings:", *conflicts]))
+            raise ValueError("\n".join(["nothing was started, as there are runs with other settings:", *conflicts]))
         launcher = Plugins.instance().instantiate_launcher(context, run, master)
         runs = {job.folder: job.config["training"]["total_frames"] for job in jobs}
         name = MANIFEST.format(master.hydra.runtime.choices.benchmark)
@@ -86,14 +86,14 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
-    """Return all runs of the benchmark ``master.benchmark`` as the command line has it, pre-training first.
+    """Return all runs of the benchmark ``master.benchmark`` with the command line applied, pre-training first.
 
-    An argument of the command line that rows have as well, such as ``task=heading``, selects rows; any other sets a
-    setting of all runs, to one value or to several. A run whose method keeps something transfers from the pre-training
-    of the same settings, which others may share.
+    An argument that is also a key of rows, such as ``task=heading``, selects rows; any other sets a setting of all
+    runs, to one value or several. If the method keeps parts, the run transfers from a pre-training with the same
+    settings, which several runs may share.
 
     Raises:
-        ValueError: If there are none, or two of different settings would share a folder.
+        ValueError: If there are none, or two runs with different settings would share a folder.
     """
     params = [f"{key}={value}" for key, value in master.benchmark.get("params", {}).items()]
     given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
@@ -118,7 +118,7 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
 
 
 def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> Iterator[Settings]:
-    """Yield every combination of every row, as far as ``choices`` allow, with every combination of the other choices.
+    """Yield the combinations of every row that ``choices`` allow, with every combination of the other choices.
 
     >>> list(expand([{"task": ["heading", "carry"]}], {"task": ["carry"], "seed": ["0", "1"]}))
     [{'task': 'carry', 'seed': '0'}, {'task': 'carry', 'seed': '1'}]
@@ -131,19 +131,19 @@ def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Se
 
 
 def values(override: Override) -> list[str]:
-    """Return the values that an argument of the command line gives its setting."""
+    """Return the values of one argument of the command line."""
     if override.is_discrete_sweep():
         return [str(value) for value in override.sweep_string_iterator()]
     return [override.get_value_element_as_str()]
 
 
 def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None = None) -> Settings:
-    """Return the settings of the pre-training, with a ``seed`` of its own if given, from which a run transfers.
+    """Return the settings of the pre-training from which a run transfers.
 
     Args:
-        settings: Those of the run.
-        task: The configuration of its task.
-        seed: That of the pre-training, if not the run's.
+        settings: Settings of the run.
+        task: Configuration of the run's task.
+        seed: Seed of the pre-training, None for the run's.
     """
     name = task["name"] if "pretrain" in task else "imitation"
     kept = {
@@ -155,17 +155,19 @@ def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None
 
 
 def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Job:
-    """Return the run of some settings, in the folder that the configuration gives it."""
+    """Return the run with these settings, in its configured folder."""
     overrides = [f"{key}={value}" for key, value in {**settings, "progress_bar": "false"}.items()]
     cfg = loader.load_sweep_config(master, overrides)
     former = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(cfg)  # for what refers to it
-    with read_write(cfg), open_dict(cfg):
-        del cfg["hydra"]
-    build.require_valid(cfg)
-    build.require_environment(cfg)
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    HydraConfig.instance().cfg = former
+    HydraConfig.instance().set_config(cfg)  # interpolations may refer to it
+    try:
+        with read_write(cfg), open_dict(cfg):
+            del cfg["hydra"]
+        build.require_valid(cfg)
+        build.require_environment(cfg)
+        config: Any = OmegaConf.to_container(cfg, resolve=True)
+    finally:
+        HydraConfig.instance().cfg = former
     return Job(Path(config["run_dir"]), overrides, config)
 
 
@@ -173,7 +175,7 @@ def require_own_folders(jobs: Sequence[Job]) -> None:
     """Check that no two jobs share a folder.
 
     Raises:
-        ValueError: If two do.
+        ValueError: If two jobs do.
     """
     owners: dict[Path, Job] = {}
     for job in jobs:
@@ -186,7 +188,7 @@ def require_own_folders(jobs: Sequence[Job]) -> None:
 
 
 def conflict(job: Job) -> str | None:
-    """Return what keeps a job from its folder, if anything."""
+    """Return why a job cannot use its folder, or None."""
     if not (job.folder / CONFIG).exists():
         return None
     held: Any = OmegaConf.to_container(experiment.run_config(job.folder), resolve=True)
@@ -196,13 +198,13 @@ def conflict(job: Job) -> str | None:
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
-    """Launch what is not complete, batch by batch as it becomes ready; return what was launched."""
+    """Launch incomplete jobs, in batches as they become ready; return the launched jobs."""
     launched: list[Job] = []
     waiting = [job for job in jobs if not is_complete(job.folder)]
     while ready := [job for job in waiting if job.needs is None or is_complete(job.needs)]:
         try:
             launcher.launch([job.overrides for job in ready], initial_job_idx=len(launched))
-        except Exception:  # whatever a launcher raises when a worker dies; the folders say what is done
+        except Exception:  # launchers raise anything when a worker dies; the folders show the finished runs
             traceback.print_exc()
         launched += ready
         waiting = [job for job in waiting if job not in ready]
@@ -210,7 +212,7 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
 
 
 def run(cfg: DictConfig) -> None:
-    """Train as configured, or go on where training stopped, with all that is printed in the run folder's log."""
+    """Train as configured, or resume; print to the log in the run folder."""
     folder = Path(cfg.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
@@ -222,12 +224,12 @@ def run(cfg: DictConfig) -> None:
 
 
 def is_complete(folder: Path) -> bool:
-    """Tell whether a folder holds a run that has ended and been evaluated."""
+    """Return whether a folder holds a finished and evaluated run."""
     return (folder / CONFIG).exists() and experiment.is_complete(folder)
 
 
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:
-    """Return why a job is not complete, if it is not."""
+    """Return why a job is not complete, or None if it is."""
     if is_complete(job.folder):
         return None
     if job in launched:

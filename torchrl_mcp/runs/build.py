@@ -1,4 +1,4 @@
-"""From a configuration to environments, an agent and its trainer: the library's door to Hydra."""
+"""Builds environments, agent and trainer from a configuration, with Hydra's ``instantiate``."""
 
 import inspect
 import os
@@ -52,7 +52,7 @@ def require_valid(cfg: DictConfig) -> None:
     """Check the values of all settings.
 
     Raises:
-        ValueError: As :func:`torchrl_mcp.runs.settings.require_valid`, or if one refers to another that is not there.
+        ValueError: As :func:`torchrl_mcp.runs.settings.require_valid`, or if a setting refers to one that is missing.
     """
     try:
         config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
@@ -65,7 +65,7 @@ def require_environment(cfg: DictConfig) -> None:
     """Check that there is an environment for the configured task, stage and character.
 
     Raises:
-        ValueError: If there is none, or the configuration names what this version does not have.
+        ValueError: If there is none, or this version lacks a class that the configuration names.
     """
     task, character = cfg.task.name, cfg.character.name
     if module := cfg.character.get("module"):
@@ -75,7 +75,7 @@ def require_environment(cfg: DictConfig) -> None:
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
             f"task={task} with stage=transfer and pretrained=<folder of the pre-training>, or pretrained=builtin"
         )
-    # The motions of a character of your own may be what introduces it, so all that is named is imported.
+    # Import everything that is named: importing a user's motions may register the user's character.
     environment, *_ = [get_object(name) for name in named(cfg.task[cfg.stage.name])]
     able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
@@ -87,12 +87,12 @@ def require_equipment(cfg: DictConfig) -> None:
     """Check that this machine has the configured device and logger.
 
     Raises:
-        ValueError: If it has not.
+        ValueError: If one is missing.
     """
     try:
         kind_of_device = torch.device(cfg.device).type
     except RuntimeError as error:
-        raise ValueError(f"device={cfg.device} is none that torch knows: pass cpu or cuda") from error
+        raise ValueError(f"torch does not know device={cfg.device}: pass cpu or cuda") from error
     if kind_of_device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
@@ -108,32 +108,32 @@ def require_equipment(cfg: DictConfig) -> None:
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:
-    """Check that everything that the configuration of a run names may be built, and is there.
+    """Check that all classes and functions in a run's configuration exist and may be called.
 
     Args:
         config: The configuration.
-        source: The file that holds it.
+        source: The file of the configuration.
 
     Raises:
-        ValueError: If something may not, or is not.
+        ValueError: If one is missing or not trusted.
     """
     names = list(targets(config))
-    # Looking for what is the library's runs nothing else.
+    # Importing the library's own modules runs no other code, so it is safe before the check of trust.
     if lost := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
         raise ValueError(
-            f"{source} is of another version of torchrl-mcp: it names {lost[0]}, which this version does not have. "
+            f"{source} is of another version of torchrl-mcp: this version has no {lost[0]}. "
             "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
         )
     require_trusted(config, source)
     if lost := [name for name in names if not _exists(name)]:
         raise ValueError(
-            f"{source} names {lost[0]}, which Python does not find: if the module is yours, add its folder to "
-            "PYTHONPATH"
+            f"{source} names {lost[0]}, which Python does not find: if the module is yours, run the command in its "
+            "folder, or add its folder to PYTHONPATH"
         )
 
 
 def named(cfg: DictConfig) -> list[str]:
-    """Return the names of all that a configuration makes."""
+    """Return the names of all classes and functions that a configuration calls."""
     return list(targets(OmegaConf.to_container(cfg, resolve=True)))
 
 
@@ -154,8 +154,8 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
 def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
     """Return the agent of the configured method.
 
-    If the checkpoint file ``pretrained`` is given, the parts that transfer keeps come from it, or in pre-training all
-    that it holds.
+    If the checkpoint file ``pretrained`` is given, the parts that transfer keeps are loaded from it; in pre-training,
+    all parts in the file are.
     """
     sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
     parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
@@ -175,7 +175,7 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
 
 
 def make_source(cfg: DictConfig) -> TrajectorySource:
-    """Return where trajectories come from."""
+    """Return the configured source of trajectories."""
     if _on_device(cfg):
         factory = partial(make_env, cfg, physics=cfg.physics, device=cfg.device)
     else:
@@ -184,10 +184,10 @@ def make_source(cfg: DictConfig) -> TrajectorySource:
 
 
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:
-    """Return the trainer of an agent; ``cfg.autocast`` is true or false, what :func:`.precision.choose` chose.
+    """Return the trainer of an agent; ``cfg.autocast`` is true or false, as chosen by :func:`.precision.choose`.
 
-    A method whose samples last for several steps, such as choices, names a ``batch_factor`` by which its batches are
-    larger than ``training.frames_per_batch``.
+    A method whose samples last for several steps, such as choices, sets ``batch_factor``: its batches are larger than
+    ``training.frames_per_batch`` by this factor.
     """
     assert isinstance(cfg.autocast, bool)
     trainable = {
@@ -230,7 +230,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
 
 def make_loggers(cfg: DictConfig) -> list[Logger]:
     """Return the configured logger, if any."""
-    # MLflow 3 wants to be asked for files, which need no server and stay in the run folder.
+    # MLflow 3 writes to files, which need no server and stay in the run folder, only if this is set.
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
     return [instantiate(cfg.logger)] if cfg.logger else []
 
@@ -245,14 +245,14 @@ def make_recorders(cfg: DictConfig, actor: Actor, folder: Path, loggers: Sequenc
 
 
 def compose_run(*overrides: str) -> DictConfig:
-    """Return the configuration that a command with these arguments would run."""
-    begun = GlobalHydra.instance().is_initialized()  # on the command line
+    """Return the configuration of ``torchrl-mcp-train`` with these arguments."""
+    begun = GlobalHydra.instance().is_initialized()  # true on the command line
     with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return compose("train", list(overrides))
 
 
 def launched() -> tuple[list[str], dict[str, str]]:
-    """Return the command line and the choices of the run that Hydra has launched, or those of this process."""
+    """Return command line and choices of config groups, of the run that Hydra launched or of this process."""
     if not HydraConfig.initialized():
         return list(sys.argv), {}
     hydra = HydraConfig.get()
@@ -262,7 +262,7 @@ def launched() -> tuple[list[str], dict[str, str]]:
 
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:
-    """Return the arguments of a class or function by name, with those that a class passes on to its bases."""
+    """Return the parameters of a class or function by its name, with those that a class passes on to its bases."""
     made = get_object(name)
     kinds = made.__mro__ if inspect.isclass(made) else ()
     found: dict[str, inspect.Parameter] = {}
@@ -288,7 +288,7 @@ def _import(module: str, character: str) -> None:
 
 
 def _on_device(cfg: DictConfig) -> bool:
-    """Tell whether training episodes are simulated where the networks are; older runs, which do not say, are not."""
+    """Return whether training episodes are simulated on the networks' device; older runs lack the setting."""
     return cfg.get("physics") == "warp"
 
 

@@ -1,15 +1,15 @@
-"""Networks that come with the library: primitives and gates that follow its generated motions, and gates for tasks."""
+"""Networks that come with the library: primitives and gates for its generated motions, and gates for tasks."""
 
 from pathlib import Path
 
 FOLDER = Path(__file__).parents[1] / "networks"
 
 PREFIX = "builtin:"
-"""What a command line says before the name of a character, for the networks of MCP that come with the library."""
+"""Prefix of the names of built-in networks on a command line, before the character."""
 
 
 def builtin(method: str, character: str, task: str | None = None) -> Path:
-    """Return a checkpoint file that comes with the library: of a method's pre-training, or of its gate for a task.
+    """Return the checkpoint file of a built-in network: a method's pre-training, or its gate for a task.
 
     Raises:
         ValueError: If there is none.
@@ -25,12 +25,12 @@ def builtin(method: str, character: str, task: str | None = None) -> Path:
 
 
 def has_task(path: Path) -> bool:
-    """Tell whether a file that comes with the library is a gate for a task."""
+    """Return whether the file of a built-in network is a gate for a task."""
     return path.stem.count("-") > 1
 
 
 def names() -> list[str]:
-    """Return what command lines may write for MCP's networks that come with the library."""
+    """Return the names of MCP's built-in networks on a command line."""
     return sorted(f"{PREFIX}{path.stem.removeprefix('mcp-')}" for path in FOLDER.glob("mcp-*.torchrl"))
 
 
@@ -38,10 +38,10 @@ def locate(checkpoint: str) -> Path:
     """Return the run folder or checkpoint file that a command line names.
 
     Args:
-        checkpoint: Its path, ``builtin:CHARACTER`` or ``builtin:CHARACTER-TASK``.
+        checkpoint: A path, ``builtin:CHARACTER`` or ``builtin:CHARACTER-TASK``.
 
     Raises:
-        ValueError: If the networks do not come with the library, or nothing has that name.
+        ValueError: If there is no such built-in network or file.
     """
     if checkpoint in names():
         return FOLDER / f"mcp-{checkpoint.removeprefix(PREFIX)}.torchrl"

@@ -10,25 +10,26 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.methods.actor import NOISE
+from torchrl_mcp.runs import policies
 from torchrl_mcp.training.run_folder import replacing
 
 INPUTS = ("observation", "goal")
 
 
 class DeterministicPolicy(nn.Module):
-    """A policy from plain tensors to its deterministic action, input normalisers included.
+    """A policy as a function of plain tensors to its deterministic action, with input normalisers.
 
     Args:
         policy: From the keys ``observation`` and ``goal`` to ``action``.
 
     Raises:
-        ValueError: If the policy reads anything else, such as the option that an environment remembers.
+        ValueError: If the policy reads other keys, such as the option that an environment stores.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        if others := [str(key) for key in policy.in_keys if key not in INPUTS]:
+        if others := [str(key) for key in policy.in_keys if key not in (*INPUTS, NOISE)]:
             raise ValueError(
                 f"the policy also reads {', '.join(others)}, which an environment remembers between steps: only "
                 f"policies of {' and '.join(INPUTS)} can be exported"
@@ -46,23 +47,23 @@ def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Ten
     """Return the policy of a run, and observations and goals for it, ``(num, S)`` and ``(num, G)``.
 
     Args:
-        path: Run folder, of which the newest checkpoint counts, or checkpoint file.
+        path: Run folder, for its newest checkpoint, or checkpoint file.
         num: Number of states.
 
     Raises:
         ValueError: If there is no checkpoint, it is damaged, or the policy is of another kind.
     """
-    _, agent, env = experiment.restore(path, num_envs=num, seed=0)
+    _, agent, env = policies.restore(path, num_envs=num, seed=0)
     state = env.reset()
     return DeterministicPolicy(agent.actor.policy).eval(), (state["observation"], state["goal"])
 
 
 def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> ExportedProgram:
-    """Return a policy as a program of tensor operations, for any number of states at a time.
+    """Return a policy as a program of tensor operations, for any batch size.
 
     Args:
         policy: The policy.
-        states: Observations and goals to trace it with, of at least two states.
+        states: Observations and goals for tracing, at least two.
     """
     batch = Dim("batch")
     with torch.no_grad():
@@ -79,7 +80,7 @@ def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path:
     """Write a policy as ONNX, inputs ``observation`` and ``goal``, output ``action``; check it if onnxruntime is there.
 
     Returns:
-        The largest difference to torch's actions in ``states``, or None without onnxruntime.
+        The largest difference from torch's actions in ``states``, or None without onnxruntime.
 
     Raises:
         ValueError: If onnx or onnxscript is not installed.
@@ -89,7 +90,7 @@ def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path:
     except ImportError as error:
         raise ValueError(f"{path} needs onnx and onnxscript: pip install 'torchrl-mcp[onnx]'") from error
     with replacing(path) as partial, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch's exporter about itself
+        warnings.simplefilter("ignore")  # torch's exporter warns about itself
         torch.onnx.export(
             export(policy, states),
             f=partial,
@@ -102,7 +103,7 @@ def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path:
 
 
 def onnx_difference(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:
-    """Return the largest difference between the actions of torch and of onnxruntime, None if that is not installed."""
+    """Return the largest difference between the actions of torch and of onnxruntime, None without onnxruntime."""
     try:
         import onnxruntime
     except ImportError:

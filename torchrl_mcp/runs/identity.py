@@ -1,6 +1,6 @@
-"""What identifies a run: which settings make it another run, and which only say how, where or from what it is made.
+"""The identity of a run: which settings make it a different run, and which only change how or where it is made.
 
-A setting is named by its path in the configuration. A path stands for all settings below it as well.
+A setting is written as its path in the configuration. A path includes all settings below it.
 """
 
 from collections.abc import Collection, Mapping
@@ -12,36 +12,36 @@ CONDUCT = frozenset(
         *("num_threads", "progress_bar", "record_interval", "recorder", "resume", "torch_threads"),
     }
 )
-"""How a run is carried out. They may change while it is interrupted."""
+"""Settings of how a run is executed. They may change when it is resumed."""
 
 PLACES = frozenset({"pretrained", "run_dir", "run_root"})
-"""Where a run lies, and where the parts that it transfers come from."""
+"""Settings of where a run is stored, and where its transferred parts come from."""
 
 LEVELS = ("task", "character", "stage", "method", "seed")
-"""Settings that have a level of their own in the path of a run folder."""
+"""Settings that are a level each of the path of a run folder."""
 
 UNNAMED = CONDUCT | PLACES | {*LEVELS, "autocast", "evaluation.episodes", "evaluation.seed"}
-"""Settings that the name of a run folder leaves out: ``exclude_keys`` of ``conf/train.yaml``."""
+"""Settings that are not in the name of a run folder: ``exclude_keys`` of ``conf/train.yaml``."""
 
 ENVIRONMENTS = frozenset(
     {"benchmark", "evaluation", "imitation", "motions", "practice", "task.evaluation", "task.practice"}
 )
-"""What configures no training, or environments that only some stages have: what a stage has of them is in ``task``."""
+"""Settings that do not affect training, or environments of some stages only; ``task`` holds those of the stage."""
 
 UNLEARNT = CONDUCT | PLACES | ENVIRONMENTS | {"autocast", "seed"}
-"""Settings that tell no runs apart where results are compared: runs that differ in them alone are averaged."""
+"""Settings that are ignored when results are compared: runs that differ only in them are averaged."""
 
 TRANSFER_ONLY = frozenset(
     {"budget.scratch", "budget.transfer", "exploration", "practice", "pretrained", "transfer.freeze", "transfer.keep"}
 )
-"""Settings that make no difference to pre-training, or that it refuses."""
+"""Settings that pre-training ignores or refuses."""
 
 LEFT_OPEN = {"autocast": "auto"}
-"""Values that leave a setting to the machine, so that any value agrees with them."""
+"""Values that leave a setting to the machine: any other value counts as equal."""
 
 
 def is_among(name: str, settings: Collection[str]) -> bool:
-    """Tell whether a setting is one of ``settings``, or below one.
+    """Return whether a setting is one of ``settings``, or below one.
 
     >>> is_among("logger.logger_type", {"logger"}), is_among("loggers", {"logger"})
     (True, False)
@@ -50,7 +50,7 @@ def is_among(name: str, settings: Collection[str]) -> bool:
 
 
 def differences(held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT) -> list[str]:
-    """Return the settings at the top of two configurations that make two runs of them.
+    """Return the top-level settings in which two configurations differ, so that they are different runs.
 
     >>> differences({"seed": 0, "device": "cpu"}, {"seed": 1, "device": "cuda"})
     ['seed']

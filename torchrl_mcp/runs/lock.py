@@ -1,4 +1,4 @@
-"""The lock of a run folder, which one process holds at a time and which ends with it, on POSIX and on Windows."""
+"""The lock of a run folder, held by one process at a time and released when it ends, on POSIX and on Windows."""
 
 import contextlib
 import os
@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import IO
 
 LOCK = ".lock"
-"""The file that is locked. It says who holds it, and is there only while somebody does, or was killed."""
+"""The locked file. It contains the holder's name, and remains only if the holder was killed."""
 
 PAUSE = 0.05
 """Seconds between attempts."""
 
 ATTEMPTS = 20
-"""Before a lock counts as held: :func:`holder` takes it for a moment as well."""
+"""Number of attempts before a lock counts as held: :func:`holder` also takes it, briefly."""
 
 if sys.platform == "win32":
     import msvcrt
 
     PLACE = 2**30
-    """Of the byte that is locked: beyond all that is written, so that everybody can read that."""
+    """Offset of the locked byte: beyond the content, so that other processes can read the content."""
 
     def _take(file: IO[str]) -> bool:
         os.lseek(file.fileno(), PLACE, os.SEEK_SET)
@@ -48,14 +48,14 @@ else:
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold the lock of a run folder while the block runs. Folders are made, and removed if nothing gets into them.
+    """Hold the lock of a run folder while the block runs. Missing folders are created, and removed if they stay empty.
 
     Args:
         folder: The run folder.
-        wait: Wait for whoever holds the lock.
+        wait: Wait until the lock is free.
 
     Raises:
-        ValueError: If another process holds it, and this one does not wait.
+        ValueError: If another process holds the lock and ``wait`` is false.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     while True:
@@ -74,7 +74,7 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def holder(folder: Path) -> str | None:
-    """Return who holds the lock of a run folder, such as ``process 4711 on host``, or None."""
+    """Return the holder of a run folder's lock, such as ``process 4711 on host``, or None."""
     try:
         with (folder / LOCK).open() as file:
             return None if _take(file) else file.read() or "another process"
@@ -83,10 +83,10 @@ def holder(folder: Path) -> str | None:
 
 
 def _taken(file: IO[str], folder: Path, wait: bool) -> bool:
-    """Take the lock; return whether it is this process's now.
+    """Try to take the lock; return whether this process holds it.
 
     Raises:
-        ValueError: If another process holds it, and this one does not wait.
+        ValueError: If another process holds the lock and ``wait`` is false.
     """
     for _ in range(ATTEMPTS):
         if _take(file):
@@ -97,12 +97,12 @@ def _taken(file: IO[str], folder: Path, wait: bool) -> bool:
     file.seek(0)
     who = file.read() or "another process"
     raise ValueError(
-        f"{folder} is in use: {who} is at work on it. Wait for that to end, or stop it, before you go on with this run"
+        f"{folder} is in use: {who} is at work on it. Wait until it ends, or stop it, before you continue this run"
     )
 
 
 def _is_there(file: IO[str], folder: Path) -> bool:
-    """Tell whether the folder still has this file: the former holder may have removed it."""
+    """Return whether the folder still has this file: the previous holder may have removed it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK))
     except FileNotFoundError:
@@ -110,8 +110,8 @@ def _is_there(file: IO[str], folder: Path) -> bool:
 
 
 def _remove(folder: Path, made: Sequence[Path]) -> None:
-    """Remove the file, and folders that were ``made``, the innermost first, if they hold nothing."""
-    with contextlib.suppress(OSError):  # Windows keeps files that are open
+    """Remove the file and, innermost first, folders in ``made`` that are empty."""
+    with contextlib.suppress(OSError):  # Windows cannot remove open files
         (folder / LOCK).unlink()
     with contextlib.suppress(OSError):
         for path in made:

@@ -1,4 +1,4 @@
-"""The machine that numbers were measured on."""
+"""Description of the machine of a measurement."""
 
 import os
 import platform
@@ -11,16 +11,16 @@ import torch
 CPUINFO = Path("/proc/cpuinfo")
 
 INSTRUCTIONS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
-"""Instruction sets on which the speed of torch on a CPU depends, the last two that of bfloat16."""
+"""Instruction sets on which torch's speed on a CPU depends; the last two are for bfloat16."""
 
 
 def machine(device: str) -> dict[str, Any]:
     """Describe this machine, JSON-compatible.
 
     Returns:
-        ``processor``, its model; ``instructions``, those of :data:`INSTRUCTIONS` that it has, separated by spaces
-        (empty where the system does not tell); ``cores`` that this process may use; ``device``, the model of a GPU or
-        the word; and the versions of ``python``, ``torch``, ``torchrl`` and ``mujoco``.
+        ``processor``, the model; ``instructions``, the available ones of :data:`INSTRUCTIONS`, separated by spaces
+        (empty if unknown); ``cores``, the number that this process may use; ``device``, the model of a GPU or
+        ``device`` itself; and the versions of ``python``, ``torch``, ``torchrl`` and ``mujoco``.
     """
     facts = _cpuinfo()
     flags = facts.get("flags", "").split()
@@ -36,7 +36,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def _cpuinfo() -> dict[str, str]:
-    """Return what Linux tells of the first processor, by name; nothing on other systems."""
+    """Return Linux's facts about the first processor, by name; empty on other systems."""
     if not CPUINFO.exists():
         return {}
     first, _, _ = CPUINFO.read_text().partition("\n\n")

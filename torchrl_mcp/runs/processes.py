@@ -1,4 +1,4 @@
-"""Functions that run side by side, each in its own process."""
+"""Functions that run in parallel, each in its own process."""
 
 import multiprocessing
 import sys
@@ -10,7 +10,7 @@ from torchrl_mcp.training.workers import end_with_parent
 
 
 def start(function: Callable[..., None], *args: Any) -> BaseProcess:
-    """Call ``function`` in a new process, which does not outlive this one, however this one ends."""
+    """Call ``function`` in a new process, which ends when this process ends for any reason."""
     process = multiprocessing.get_context("spawn").Process(target=_call, args=(function, *args), daemon=True)
     process.start()
     return process
@@ -20,13 +20,13 @@ def ticks(processes: Sequence[BaseProcess], interval: float) -> Iterator[None]:
     """Yield every ``interval`` seconds while any of the processes runs, and once more after they have ended.
 
     Raises:
-        ValueError: If a process fails; it has said why on the terminal.
+        ValueError: If a process fails; the reason is on the terminal.
     """
     while running := [process for process in processes if process.is_alive()]:
         yield
         running[0].join(interval)
         if any(process.exitcode for process in processes):
-            raise ValueError("one of the processes has failed, for the reason above; nothing that is done is lost")
+            raise ValueError("one of the processes has failed, for the reason above; finished work is kept")
     yield
 
 

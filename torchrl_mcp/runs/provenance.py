@@ -15,16 +15,16 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision) -> dict[str, Any]:
-    """Return where a run comes from, JSON-compatible.
+    """Return the provenance of a run, JSON-compatible.
 
     Args:
-        device: Where its networks are.
-        command: The words of the command that began it.
-        choices: The choice of each group of its configuration.
-        precision: What its networks compute in.
+        device: Device of the networks.
+        command: Words of the command that started the run.
+        choices: Choice of each group of the configuration.
+        precision: Precision of the networks.
 
     Returns:
-        ``command``; ``commit`` of the library, with ``-dirty`` where files were changed since, or None where it is no
+        ``command``; ``commit`` of the library, with ``-dirty`` if files were changed since, or None without a
         checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``started``, an ISO time; and the
         ``machine``.
     """
@@ -43,7 +43,7 @@ def commit(folder: Path) -> str | None:
     """Return the abbreviated commit of the Git checkout that tracks ``folder``, or None."""
     if shutil.which("git") is None:
         return None
-    # An installed package may lie in a checkout as well, which then says nothing of it.
+    # An installed package may lie inside an unrelated checkout, which does not track it.
     if not _git(folder, "ls-files", "."):
         return None
     return _git(folder, "describe", "--always", "--dirty", "--exclude=*")

@@ -1,7 +1,7 @@
-"""Checkpoints for others: the policy alone, as small as those that come with the library.
+"""Published checkpoints: the policy alone, as small as the built-in networks.
 
-A gate that was trained over primitives that come with the library is published without them: the file names these
-*shared* parts by their fingerprints, and whoever restores it takes them from the library's own networks.
+A gate that was trained over built-in primitives is published without them: the file lists the fingerprints of these
+*shared* parts, and restoring it loads them from the built-in networks.
 """
 
 import copy
@@ -19,15 +19,15 @@ from torchrl_mcp.training.transfer import fingerprint
 def publish(
     parts: nn.ModuleDict, config: Mapping[str, Any], path: Path, *, shared: Mapping[str, str] | None = None
 ) -> None:
-    """Write parts of an agent, parameters rounded to bfloat16, as a checkpoint to play or to transfer from.
+    """Write parts of an agent as a checkpoint to play or to transfer from, with parameters rounded to bfloat16.
 
     Networks that run in bfloat16 autocast round their parameters anyway.
 
     Args:
-        parts: What to write, by name.
+        parts: Parts of the agent, by name.
         config: The run's configuration.
-        path: The file; its folder is made.
-        shared: Fingerprints of parts that others hold, by name. They are left out.
+        path: The file; its folder is created.
+        shared: Fingerprints of the parts to leave out, by name, because the built-in networks hold them.
     """
     shared = dict(shared or {})
     own = copy.deepcopy(nn.ModuleDict({name: part for name, part in parts.items() if name not in shared}))
@@ -38,15 +38,15 @@ def publish(
 
 
 def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> dict[str, str]:
-    """Return the fingerprints of parts that are to the bit those of a checkpoint file.
+    """Return the fingerprints of parts, after checking that they equal those of a checkpoint file bit for bit.
 
     Args:
         parts: Parts of an agent.
-        names: Which of them to compare.
-        origin: The file.
+        names: Names of the parts to compare.
+        origin: The checkpoint file.
 
     Raises:
-        ValueError: If one differs, or the file does not hold it.
+        ValueError: If a part differs, or the file does not hold it.
     """
     held = nn.ModuleDict({name: copy.deepcopy(parts[name]) for name in names})
     checkpoint.load_parts(held, names, origin)
@@ -60,15 +60,15 @@ def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> 
 
 
 def take_shared(parts: nn.ModuleDict, path: Path, origin: Path) -> None:
-    """Restore the parts that a published file leaves to the library's own networks.
+    """Restore the parts that a published file omits, from a built-in network.
 
     Args:
         parts: Parts of an agent.
         path: The published file.
-        origin: The library's file.
+        origin: The file of the built-in network.
 
     Raises:
-        ValueError: If the library's networks are others than those that the policy was trained over.
+        ValueError: If the policy was trained over other parts than the built-in network has.
     """
     expected = checkpoint.shared(path)
     checkpoint.load_parts(parts, expected, origin)

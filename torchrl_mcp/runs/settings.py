@@ -1,4 +1,4 @@
-"""The values that settings may have, checked once, before anything is written."""
+"""Checks of the values of settings, once, before anything is written."""
 
 import math
 import os
@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 
 class Rule(NamedTuple):
-    """What a setting may be.
+    """A rule for the value of a setting.
 
     Attributes:
-        words: What a message says of it.
-        allows: Whether a value is that.
+        words: Description for error messages.
+        allows: Function that returns whether a value is valid.
     """
 
     words: str
@@ -64,7 +64,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
         num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor checkpoint_interval
         keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options latent_dim
-        steps_per_choice explorer.steps
+        steps_per_choice explorer.steps size
     """,
     COUNT.or_null(): "torch_threads record_interval practice.max_episode_steps",
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
@@ -80,7 +80,8 @@ NAMES_BY_RULE: dict[Rule, str] = {
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     SHARE: """
-        gamma lmbda discount epsilon momentum terminations.initial initial_states.rest initial_states.motions
+        gamma lmbda discount epsilon momentum correlation terminations.initial initial_states.rest
+        initial_states.motions beginnings_in_motion
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
@@ -103,20 +104,20 @@ NAMES_BY_RULE: dict[Rule, str] = {
 }
 
 RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}
-"""By the end of a setting's path: what is called alike means the same wherever it stands."""
+"""Rules by the end of a setting's path: settings of one name have one rule, wherever they are."""
 
 GROUPS = ("task", "stage", "character", "method", "training", "evaluation", "optimizer", "objective", "transfer")
-"""Settings that hold others."""
+"""Settings that are groups of settings."""
 
 
 def require_valid(config: Mapping[str, Any]) -> None:
-    """Check the value of every setting that is of the library.
+    """Check the value of every setting of the library.
 
     Args:
         config: The resolved configuration of a run.
 
     Raises:
-        ValueError: If some are wrong, with all of their names, values and what they may be.
+        ValueError: If any are wrong, with the name, value and rule of each.
     """
     lost = [name for name in GROUPS if not isinstance(config.get(name), Mapping)]
     wrong = [f"{name}={_shown(config.get(name))} must be a group of settings" for name in lost]
@@ -137,7 +138,7 @@ def _rule(path: str) -> Rule | None:
 
 
 def _settings(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every setting that holds no others, with its path; a list of groups counts as groups."""
+    """Yield every setting that is not a group, with its path; a list of groups counts as groups."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from _settings(inner, f"{path}.{key}" if path else str(key))
@@ -149,7 +150,7 @@ def _settings(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _escapes(folder: str, root: str) -> bool:
-    """Tell whether a run folder that is written as below ``root`` is not."""
+    """Return whether a path that begins with ``root`` leaves it, as by ``..``."""
     inside = Path(os.path.normpath(folder)).is_relative_to(os.path.normpath(root))
     return folder.startswith(f"{root}/") and not inside
 

@@ -1,6 +1,6 @@
 """The progress of the runs of a folder.
 
-Everything is read from the run folders, so it works beside a benchmark in any process on any machine that shares them.
+It is read from the run folders, so any process on any machine that shares them can show it while a benchmark runs.
 """
 
 import csv
@@ -29,14 +29,14 @@ from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, NO
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
 
-# What reading a damaged file raises.
+# Exceptions of reading a damaged file.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, csv.Error)
 
 INTERVAL = 1.0
-"""Seconds between looks at the folders."""
+"""Seconds between updates."""
 
 Runs = Mapping[Path, int | None]
-"""Run folders and their environment steps in all, None for those of their configuration."""
+"""Run folders with their total environment steps, None for the total in their configuration."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Status:
     """The progress of a run.
 
     Attributes:
-        folder: Its run folder.
+        folder: Run folder.
         state: ``waiting``, ``running``, ``stopped`` (failed, or killed), ``done`` (with its last checkpoint and its
             evaluation, if there is one), or ``damaged`` (cannot be read).
         frames: Environment steps so far.
-        total: Environment steps in all.
-        speed: Environment steps per second, of the last iteration.
-        normalised_return: That of the evaluation, or of training as long as there is none; None if there is neither.
+        total: Environment steps of the whole run.
+        speed: Environment steps per second in the last iteration.
+        normalised_return: Normalised return of the evaluation, else of training; None if there is neither.
     """
 
     folder: Path
@@ -62,13 +62,13 @@ class Status:
 
     @property
     def remaining(self) -> float | None:
-        """Seconds to the end of training, or None where nobody knows."""
+        """Seconds to the end of training, or None if unknown."""
         return (self.total - self.frames) / self.speed if self.state == "running" and self.speed else None
 
 
 @contextmanager
 def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
-    """Show how far ``runs`` are, or all of a folder, while the block runs: a table, or where there is none, lines."""
+    """Show the progress of ``runs``, or of all in a folder, while the block runs: a table on a terminal, else lines."""
     console = Console(file=sys.stdout)
     if console.is_terminal:
         with Live(
@@ -89,7 +89,7 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
 
 
 def look(folder: Path, runs: Runs | None = None) -> list[Status]:
-    """Return how far ``runs`` are, or else all that lie in ``folder`` or that benchmarks there have planned."""
+    """Return the status of ``runs``, or of all runs that are in ``folder`` or planned by benchmarks there."""
     damaged: list[Status] = []
     if runs is None:
         found: dict[Path, int | None] = {path.parent.resolve(): None for path in sorted(folder.rglob(CONFIG))}
@@ -110,18 +110,18 @@ def _status(run: Path, total: int | None) -> Status:
 
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
-    """Write down which runs a benchmark has and how many steps each takes, for those who look on."""
+    """Write the list of a benchmark's runs and their steps, for other processes to read."""
     steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
     write_json(steps, path)
 
 
 def read_manifest(path: Path) -> dict[Path, int]:
-    """Return which runs a benchmark has and how many steps each takes."""
+    """Return the runs of a benchmark and the steps of each."""
     return {(path.parent / run).resolve(): int(total) for run, total in read_json(path).items()}
 
 
 def status(run: Path, total: int | None = None) -> Status:
-    """Return how far the run in a folder is, of ``total`` environment steps or those of its configuration."""
+    """Return the status of a run of ``total`` environment steps, by default those in its configuration."""
     total = _plan(run)[0] if total is None else total
     last = _last_row(run / METRICS)
     frames = int(last.get("frames", 0))
@@ -138,7 +138,7 @@ def status(run: Path, total: int | None = None) -> Status:
 
 
 def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -> Table:
-    """Return a table of runs, those first that want to be seen, of at most ``height`` rows."""
+    """Return a table of runs, in the order of :data:`STYLES`, of at most ``height`` rows."""
     order = list(STYLES)
     rows = sorted(statuses, key=lambda one: order.index(one.state))
     shown = rows if height is None or len(rows) <= height else rows[: max(height, 1)]
@@ -155,7 +155,7 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
 
 def _tell(folder: Path, runs: Runs | None, ended: threading.Event) -> None:
     """Print a line whenever a run changes its state."""
-    terminal = sys.stdout  # which runs in this process replace by their log
+    terminal = sys.stdout  # runs in this process replace sys.stdout by their log
     known: dict[Path, str] = {}
     last = False
     while not last:
@@ -188,18 +188,18 @@ def _name(run: Path, folder: Path) -> str:
 
 @cache
 def _plan(run: Path) -> tuple[int, int]:
-    """Return the environment steps of a run that has begun, and the episodes of the evaluation after them."""
+    """Return the environment steps of a run that has begun, and the episodes of its final evaluation."""
     config = read_config(run / CONFIG)
     return int(config["training"]["total_frames"]), int(config.get("evaluation", {}).get("episodes", 0))
 
 
 def _is_saved(run: Path, total: int) -> bool:
-    """Tell whether a run has the checkpoint of its end, which is written after the last row."""
+    """Return whether a run has its final checkpoint, which is written after the last row."""
     return any(run_folder.frames(path) >= total for path in run_folder.find_all(run))
 
 
 def _last_row(path: Path) -> dict[str, float]:
-    """Return the last whole row of a CSV file of numbers, or nothing."""
+    """Return the last complete row of a CSV file of numbers, or an empty one."""
     if not path.exists():
         return {}
     with path.open("rb") as file:

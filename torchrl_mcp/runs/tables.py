@@ -9,15 +9,15 @@ from rich.table import Table
 from rich.text import Text
 
 WIDEST = 10_000
-"""Characters of a line: files and pipes have no width into which a table would have to be folded."""
+"""Characters of a line: tables in files and pipes are never folded."""
 
 
 def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) -> str:
     """Return rows as text with aligned columns, numbers to the right.
 
     Args:
-        rows: Cells by the names of their columns, of the same names in every row. A float has three decimals; an empty
-            text is no value.
+        rows: Cells by column name, with the same names in every row. Floats get three decimals; an empty text means no
+            value.
         markdown: Draw the lines of a Markdown table.
     """
     table = Table(box=MARKDOWN) if markdown else plain_table()

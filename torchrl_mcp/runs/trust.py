@@ -1,7 +1,7 @@
-"""Configurations that come from files: what they may name, and how they are read.
+"""Reading configurations from files, and checking which classes and functions they may call.
 
-A configuration names the classes and functions to build. One of a checkpoint or run folder may be a stranger's, so it
-gets what the library's own files name, and nothing else that the user has not said to trust.
+A configuration names classes and functions to call. A checkpoint or run folder may come from a stranger, so its
+configuration may only call names in the library's own files and names that the user trusts.
 """
 
 import pkgutil
@@ -17,13 +17,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 LARGEST = 2**20
-"""Bytes of a configuration file. One of a run has some ten thousand."""
+"""Most bytes of a configuration file. A run's has about ten thousand."""
 
 DEEPEST = 100
-"""Brackets in brackets of a configuration file. One of a run has five or so."""
+"""Deepest nesting of brackets in a configuration file. A run's is about five."""
 
 GET_CLASS = "hydra.utils.get_class"
-"""Hydra's function that returns a class, which configurations hand on to others."""
+"""Hydra's function that returns a class, for configurations that pass a class as an argument."""
 
 KNOWN = frozenset(
     {
@@ -51,7 +51,7 @@ KNOWN = frozenset(
             ),
             "methods.options": ("SeparateOptions", "Terminations"),
             "methods.scratch": ("gaussian_actor", "gaussian_parts"),
-            "methods.transforms": ("ClipAsOption", "OptionMemory"),
+            "methods.transforms": ("ClipAsOption", "CorrelatedNoise", "OptionMemory"),
             "modules": (
                 *("GaussianPolicy", "Gating", "GoalEncoder", "InjectedPolicy", "JointGating", "Primitives"),
                 "StateGoalEncoder",
@@ -67,17 +67,17 @@ KNOWN = frozenset(
         for name in names
     }
 )
-"""What the files of ``conf`` name."""
+"""Classes and functions that the files of ``conf`` name."""
 
 _trusted: ContextVar[frozenset[str]] = ContextVar("trusted", default=frozenset())
 
 
 @contextmanager
 def trusting(names: Collection[str]) -> Iterator[None]:
-    """Let configurations of files name more while the block runs.
+    """Trust further names in configurations from files while the block runs.
 
     Args:
-        names: Of modules, for all that they define, or of single classes and functions.
+        names: Modules, for everything that they define, or single classes and functions.
     """
     token = _trusted.set(_trusted.get() | set(names))
     try:
@@ -87,7 +87,7 @@ def trusting(names: Collection[str]) -> Iterator[None]:
 
 
 def targets(config: Any) -> Iterator[str]:
-    """Yield the name of everything that a configuration makes, hands on or imports, from the top."""
+    """Yield the names of all classes, functions and modules in a configuration, from the top."""
     if isinstance(config, Mapping):
         if isinstance(module := config.get("module"), str):
             yield module
@@ -102,14 +102,14 @@ def targets(config: Any) -> Iterator[str]:
 
 
 def require_trusted(config: Mapping[str, Any], source: Path) -> None:
-    """Check, before anything is imported, that a configuration names nothing but what may be built.
+    """Check, before anything is imported, that a configuration names only trusted classes and functions.
 
     Args:
         config: The configuration.
-        source: The file that holds it.
+        source: The file of the configuration.
 
     Raises:
-        ValueError: If it does, or holds an interpolation, which could read the environment.
+        ValueError: If a name is not trusted, or there is an interpolation, which could read environment variables.
     """
     if name := next((name for name in targets(config) if not _may_be_built(name)), None):
         raise ValueError(
@@ -121,11 +121,11 @@ def require_trusted(config: Mapping[str, Any], source: Path) -> None:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Return the configuration in a YAML file, with interpolations as they are written.
+    """Return the configuration in a YAML file, with interpolations unresolved.
 
     Raises:
-        ValueError: If it is no such file, is too large, refers to parts of itself or is nested too deeply.
-        OSError: If it cannot be read.
+        ValueError: If the file is no configuration, is too large, refers to parts of itself or is nested too deeply.
+        OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
         raise ValueError(f"{path} has more than {LARGEST} bytes: that is no configuration")
@@ -133,7 +133,7 @@ def read_config(path: Path) -> dict[str, Any]:
     if _depth(text) > DEEPEST:
         raise ValueError(f"{path} is no configuration: brackets are nested more than {DEEPEST} deep")
     try:
-        # Aliases of aliases make a few lines so large that no one ever reads them all.
+        # With aliases of aliases, a few lines expand to more than memory holds.
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError(f"{path} refers to parts of itself (YAML aliases), which training never writes")
         config: Any = OmegaConf.to_container(OmegaConf.create(text))
@@ -146,19 +146,19 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def _depth(text: str) -> int:
-    """Return how deep brackets are nested in a text."""
+    """Return the depth of nested brackets in a text."""
     return max(accumulate((letter in "[{") - (letter in "]}") for letter in text), default=0)
 
 
 def _may_be_built(name: str) -> bool:
-    """Tell whether a configuration of a file may name this. Nothing is imported but modules that are trusted."""
+    """Return whether a configuration from a file may contain a name. Only trusted modules are imported."""
     trusted = _trusted.get()
     if name in KNOWN | trusted:
         return True
     if not _is_in(name, trusted):
         return False
     try:
-        # A trusted module may have imported others, which are not meant.
+        # Trust does not extend to names that a trusted module imports from others.
         return _is_in(f"{pkgutil.resolve_name(name).__module__}.", trusted)
     except (ImportError, AttributeError, ValueError):
         return True  # there is nothing to build

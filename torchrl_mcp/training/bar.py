@@ -1,4 +1,4 @@
-"""What training shows while it runs."""
+"""The progress of training on a terminal."""
 
 import math
 import sys
@@ -10,17 +10,17 @@ from tqdm import tqdm
 from torchrl_mcp.evaluation.bars import bar
 
 QUIET = 60.0
-"""Seconds between lines where there is no terminal."""
+"""Seconds between lines if there is no terminal."""
 
 
 class TrainingBar:
-    """Steps, time left and return of a training: a bar, or where there is no terminal, a line every minute.
+    """Steps, time left and return of a training: a bar on a terminal, else a line every minute.
 
     Args:
-        total: Environment steps in all, of which the last batch may take more.
+        total: Environment steps of the training; the last batch may exceed it.
         done: Steps so far.
         shown: Whether to show anything.
-        file: Where to, standard error by default.
+        file: Output stream, standard error by default.
     """
 
     def __init__(self, total: int, done: int = 0, *, shown: bool = True, file: TextIO | None = None) -> None:
@@ -36,7 +36,7 @@ class TrainingBar:
             )
 
     def __enter__(self) -> "TrainingBar":
-        """Begin."""
+        """Return the bar."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -48,8 +48,8 @@ class TrainingBar:
         """Count a batch.
 
         Args:
-            steps: Environment steps of it.
-            normalised_return: Mean of the episodes that ended in it; NaN, if none did, leaves the last that is known.
+            steps: Environment steps of the batch.
+            normalised_return: Mean over episodes that ended in the batch; NaN if none did, to keep showing the last.
         """
         self._done += steps
         if math.isfinite(normalised_return):

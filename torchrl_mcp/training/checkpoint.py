@@ -1,8 +1,8 @@
 """Checkpoints: one archive per save, written atomically, checked on loading, and free of pickled code.
 
 They are TorchRL's own :class:`torchrl.checkpoint.Checkpoint` archives: a ZIP file with a checksum per tensor and a JSON
-manifest that holds the run's configuration and the library versions. Every part of an agent is a component of its
-own, so that transfer loads the ones it keeps.
+manifest that holds the run's configuration and the library versions. Every part of an agent is a separate
+component, so that transfer can load only the parts that it keeps.
 """
 
 import re
@@ -22,12 +22,12 @@ from torchrl_mcp.training.run_folder import CHECKPOINT, CHECKPOINTS, find_all, r
 FOLDER = CHECKPOINTS
 
 DAMAGED = ".damaged"
-"""At the end of the name of a checkpoint that could not be restored."""
+"""Suffix of the name of a checkpoint that could not be restored."""
 
 REFUSAL = re.compile(r"unable to .*file <.*: (.*)", re.DOTALL)
-"""What torch says when the system refuses it a file, with the system's reason."""
+"""Torch's error message when the system refuses to write a file, with the system's reason."""
 
-# What torchrl, tensordict, zipfile and json raise when a file is damaged or of another kind.
+# Exceptions of torchrl, tensordict, zipfile and json when a file is damaged or of another kind.
 UNREADABLE = (
     AttributeError,
     BadZipFile,
@@ -77,9 +77,9 @@ def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None
 
 
 def load_agent(parts: nn.ModuleDict, path: Path) -> None:
-    """Restore all parts of an agent from the checkpoint file ``path``, but for those that it need not hold.
+    """Restore all parts of an agent from the checkpoint file ``path``.
 
-    These are the critic, and what the file says to be :func:`shared`.
+    The file may lack the critic and the parts that it declares as :func:`shared`.
 
     Raises:
         ValueError: As :func:`load`.
@@ -89,15 +89,15 @@ def load_agent(parts: nn.ModuleDict, path: Path) -> None:
 
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
-    """Return the checkpoints of a run folder, of which the newest ``keep_last`` stay."""
+    """Return the rotation of a run folder's checkpoints, which keeps the newest ``keep_last``."""
     return CheckpointRotation(run / FOLDER, keep_last=keep_last)
 
 
 def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
-    """Write ``checkpoint`` among ``checkpoints``. It is on the disk before older ones are removed.
+    """Write ``checkpoint`` to the rotation ``checkpoints``. It is on the disk before older ones are removed.
 
     Raises:
-        OSError: If it cannot be written, as where the disk is full.
+        OSError: If it cannot be written, for example because the disk is full.
     """
     path = checkpoints.directory / CHECKPOINT.format(step)
     try:
@@ -124,7 +124,7 @@ def find(path: Path) -> Path:
 
 
 def is_intact(path: Path) -> bool:
-    """Tell whether the file ``path`` is a whole checkpoint, with a manifest and all checksums right."""
+    """Return whether the file ``path`` is a complete checkpoint, with a manifest and correct checksums."""
     try:
         _manifest(path)
         with ZipFile(path) as archive:
@@ -134,7 +134,7 @@ def is_intact(path: Path) -> bool:
 
 
 def set_aside(path: Path) -> None:
-    """Give a damaged checkpoint another name, by which nobody takes it for one of the run's."""
+    """Rename a damaged checkpoint, so that it no longer counts as a checkpoint of the run."""
     path.replace(path.with_name(f"{path.name}{DAMAGED}"))
 
 
@@ -148,7 +148,7 @@ def saved_config(path: Path) -> Mapping[str, Any]:
 
 
 def shared(path: Path) -> Mapping[str, str]:
-    """Return the parts that the checkpoint file ``path`` lacks because other networks hold them, with fingerprints.
+    """Return the fingerprints, by name, of the parts that the checkpoint file ``path`` leaves to other networks.
 
     Raises:
         ValueError: If the file is not a checkpoint of this library.
@@ -157,7 +157,7 @@ def shared(path: Path) -> Mapping[str, str]:
 
 
 def _manifest(path: Path) -> Mapping[str, Any]:
-    """Return what the checkpoint file ``path`` says of itself."""
+    """Return the manifest of the checkpoint file ``path``."""
     try:
         _require_plain_data(path)
         manifest = Checkpoint.manifest(path)
@@ -169,9 +169,9 @@ def _manifest(path: Path) -> Mapping[str, Any]:
 
 
 def _require_plain_data(path: Path) -> None:
-    """Refuse an archive with anything but JSON and tensors, as large as they are.
+    """Refuse an archive with compressed files, or with other files than JSON and tensors.
 
-    Of other files tensordict would unpickle some, which can run any code, and what is compressed could fill a disk.
+    Tensordict would unpickle some other files, which can run any code, and compressed files could fill a disk.
     """
     with ZipFile(path) as archive:
         for name in archive.namelist():
@@ -182,7 +182,7 @@ def _require_plain_data(path: Path) -> None:
 
 
 def _tells_of_another_version(record: LogRecord) -> bool:
-    """Tell whether TorchRL's warning of other versions is worth it: builds of one version, as for CUDA, are alike."""
+    """Return whether to log a warning of TorchRL about versions: builds of one version, as for CUDA, do not count."""
     pairs = re.findall(r"checkpoint='([^'+]*)[^']*', runtime='([^'+]*)[^']*'", record.getMessage())
     return not pairs or any(checkpoint != runtime for checkpoint, runtime in pairs)
 

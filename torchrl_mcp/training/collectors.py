@@ -23,16 +23,16 @@ from torchrl_mcp.training.workers import attend, end, end_with_parent, new_worke
 Environments = CharacterEnv | TransformedCharacterEnv
 
 PATIENCE = 5.0
-"""Seconds that workers have to end by themselves."""
+"""Seconds after which workers that have not ended are killed."""
 
 
 class TrajectorySource(Protocol):
     """The interface of trajectory sources.
 
     Attributes:
-        env: Environments like those that are stepped, of any number.
-        num_envs: Number of environments that are stepped, ``N``.
-        resumes_episodes: Whether a resumed run goes on within its episodes, or begins new ones.
+        env: Environments of the same kind as the stepped ones, of any number.
+        num_envs: Number of stepped environments, ``N``.
+        resumes_episodes: Whether a resumed run continues its episodes, or begins new ones.
     """
 
     env: Environments
@@ -48,34 +48,34 @@ class TrajectorySource(Protocol):
         autocast: bool,
         stopwatch: Stopwatch,
     ) -> None:
-        """Get ready to act by ``policy``, ``N * T = frames_per_batch`` steps at a time."""
+        """Prepare collection with ``policy``, in batches of ``N * T = frames_per_batch`` steps."""
         ...
 
     def collect(self) -> TensorDictBase:
-        """Return the next trajectories ``(N, T)`` on the device of the start, and time them."""
+        """Return the next trajectories ``(N, T)`` on the ``device`` of :meth:`start`, and time their collection."""
         ...
 
     def metrics(self) -> dict[str, float]:
-        """Return what is worth recording of the environments themselves."""
+        """Return metrics of the environments themselves."""
         ...
 
     def stop(self) -> None:
-        """Release what :meth:`start` has taken."""
+        """Release the resources of :meth:`start`."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed run needs."""
+        """Return the state for a resumed run."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave, before the start."""
+        """Restore the state of :meth:`state_dict`, before :meth:`start`."""
         ...
 
 
 class LocalSource:
     """A trajectory source of environments in this process.
 
-    Their state is its own, so that a resumed run goes on within their episodes, to the same numbers.
+    Its state includes the environments' state, so that a resumed run continues their episodes to the same numbers.
 
     Args:
         env: Environments, batch size ``[N]``, with or without transforms.
@@ -112,26 +112,26 @@ class LocalSource:
             auto_register_policy_transforms=False,
             track_traj_ids=False,
         )
-        # Setting up a collector draws random numbers, which a resumed run must not notice.
+        # Setting up a collector draws random numbers, which must not change the numbers of a resumed run.
         GlobalRNGState().load_state_dict(random)
         self._batches = iter(self._collector)
 
     def collect(self) -> TensorDictBase:
         """Return the next trajectories; the time goes to ``physics`` and ``forward``."""
         before = self.env.physics_seconds
-        # OpenMP's threads spin for milliseconds after each operation that they share, longer than many a control step
-        # takes: torch keeps to this thread, and the processors are left to physics.
+        # OpenMP's threads spin for milliseconds after each parallel operation, often longer than a control step takes.
+        # So torch uses this thread alone, and leaves the other processors to physics.
         with self._precision(), threads(1):
             batch = next(self._batches)
         self._stopwatch.add("physics", self.env.physics_seconds - before)
         return batch
 
     def metrics(self) -> dict[str, float]:
-        """Return the number of simulations that became unstable so far."""
+        """Return the number of simulations that have diverged so far."""
         return {"episode/diverged": self.env.num_diverged}
 
     def stop(self) -> None:
-        """Shut the collector down, and the environments with it."""
+        """Shut down the collector and its environments."""
         self._collector.shutdown()
 
     def state_dict(self) -> dict[str, Any]:
@@ -144,24 +144,24 @@ class LocalSource:
 
 
 def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) -> LocalSource:
-    """Return a source in this process, of environments that ``make_env(num_envs=, seed=)`` returns."""
+    """Return a source in this process with the environments of ``make_env(num_envs=, seed=)``."""
     return LocalSource(make_env(num_envs=num_envs, seed=seed))
 
 
 class RemoteSource:
-    """A trajectory source of workers, started by one of TorchRL's backends, that act by the newest weights.
+    """A trajectory source of workers, which a TorchRL backend starts and which act with the newest weights.
 
-    A resumed run begins new episodes, other ones than those that it began with.
+    A resumed run begins new episodes, with other seeds than the first ones.
 
     Args:
-        make_env: Called in each worker as ``make_env(num_envs=, seed=, num_threads=)`` for environments; picklable.
-        num_envs: Number of environments of all workers together, ``N``.
-        seed: Seed of environments and exploration, from which each worker derives one of its own.
+        make_env: Makes the environments of a worker as ``make_env(num_envs=, seed=, num_threads=)``; picklable.
+        num_envs: Total number of environments of all workers, ``N``.
+        seed: Seed of environments and exploration, from which the workers' seeds are derived.
         num_workers: Number of workers.
-        num_threads: Of each worker's physics.
-        backend: Of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``, ``rpc`` or
-            ``submitit``.
-        backend_options: Its options.
+        num_threads: Number of threads of each worker's physics.
+        backend: Backend of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``,
+            ``rpc`` or ``submitit``.
+        backend_options: Options of the backend.
 
     Raises:
         ValueError: If the environments do not divide evenly, or Ray is not installed.
@@ -214,7 +214,7 @@ class RemoteSource:
                 num_collectors=self.num_workers,
                 sync=True,
                 frames_per_batch=frames_per_batch,
-                total_frames=frames_per_batch * 10**9,  # not all backends know of an endless collection
+                total_frames=frames_per_batch * 10**9,  # not all backends support endless collection
                 env_device="cpu",
                 policy_device=device,
                 storing_device=device,
@@ -224,7 +224,7 @@ class RemoteSource:
         self._batches: Iterator[TensorDictBase] | None = None
 
     def collect(self) -> TensorDictBase:
-        """Return the next trajectories, of the newest weights; the time goes to ``collection``.
+        """Return the next trajectories, from the newest weights; the time goes to ``collection``.
 
         Raises:
             ChildProcessError: If a worker on this machine has ended.
@@ -233,11 +233,11 @@ class RemoteSource:
             return attend(self._next, self._workers).reshape(self.num_envs, self._steps).to(self._device)
 
     def metrics(self) -> dict[str, float]:
-        """Return nothing: the environments are elsewhere."""
+        """Return no metrics: the environments are in the workers."""
         return {}
 
     def stop(self) -> None:
-        """Stop the workers, also those that hang."""
+        """Stop the workers, including those that hang."""
         try:
             self._collector.shutdown(timeout=PATIENCE)
         finally:
@@ -245,11 +245,11 @@ class RemoteSource:
             self._watched.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return how often the workers have been started."""
+        """Return the number of starts of the workers."""
         return {"starts": self._starts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore how often they have been started, so that they begin with other episodes."""
+        """Restore the number of starts, so that the workers begin with new seeds."""
         self._starts = state["starts"]
 
     def _next(self) -> TensorDictBase:
@@ -273,7 +273,7 @@ class _Autocast(TensorDictModuleBase):
 
 
 def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **settings: int) -> Environments:
-    """Return the environments of a worker, in its process, whose exploration is its own."""
+    """Return a worker's environments, called in its process; seed its exploration and tie its life to the parent."""
     end_with_parent()
     torch.manual_seed(seed)
     torch.set_num_threads(1)

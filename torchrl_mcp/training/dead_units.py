@@ -1,4 +1,4 @@
-"""Hidden units that no input activates any more, so that no gradient reaches them."""
+"""Dead units: hidden units that no input activates any more, so that no gradient reaches them."""
 
 import warnings
 from collections.abc import Callable
@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 
 TOO_MANY = 0.2
-"""Share of dead units in a hidden layer from which on the trainer warns."""
+"""Share of dead units in a hidden layer above which the trainer warns."""
 
 MIN_SAMPLES = 64
-"""Samples from which on units are judged: an option that hardly acts has seen too few."""
+"""Least number of samples to judge units by: an option that rarely acts sees fewer."""
 
 
 class DeadUnits:
-    """A watch over the hidden layers of networks: a unit is dead that is zero for all samples of an evaluation.
+    """Detects dead units in the hidden layers of networks: units that are zero for all samples of an evaluation.
 
     Args:
         networks: Networks by name, whose hidden layers end in :class:`torch.nn.ReLU`.
@@ -31,13 +31,13 @@ class DeadUnits:
     def __call__(self, evaluate: Callable[[], Any]) -> dict[str, float]:
         """Return the share of dead units in the worst hidden layer of each network that ``evaluate`` runs.
 
-        A layer is named once in a warning when its share passes :data:`TOO_MANY`.
+        A warning appears once for a layer, when its share passes :data:`TOO_MANY`.
 
         Args:
             evaluate: Evaluates networks on samples of one batch dimension.
 
         Returns:
-            Shares as ``dead_units/<network>``, 0 where all layers saw less than :data:`MIN_SAMPLES`.
+            Shares as ``dead_units/<network>``, 0 if all layers saw fewer than :data:`MIN_SAMPLES`.
         """
         shares: dict[str, Tensor] = {}
         with ExitStack() as hooks:
@@ -65,6 +65,6 @@ class DeadUnits:
 
 
 def _record(shares: dict[str, Tensor], name: str, layer: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:
-    """Note under ``name`` the share of the units of ``output``, ``(B, ...)``, that are zero in all of B samples."""
+    """Store under ``name`` the share of the units of ``output``, ``(B, ...)``, that are zero in all B samples."""
     judged = len(output) >= MIN_SAMPLES
     shares[name] = (output <= 0).all(0).float().mean() if judged else output.new_zeros((), dtype=torch.float32)

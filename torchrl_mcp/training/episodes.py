@@ -1,4 +1,4 @@
-"""Returns and lengths of the episodes that end while training."""
+"""Returns and lengths of the episodes that end during training."""
 
 import torch
 from tensordict import TensorDictBase
@@ -8,7 +8,7 @@ from torchrl_mcp.envs.transfer import task_reward
 
 
 class EpisodeStatistics:
-    """Returns and lengths of episodes that span several batches: the task's own rewards, without shaping.
+    """Returns and lengths of episodes that span several batches, from the task's own rewards without shaping.
 
     Args:
         num_envs: Number of environments, ``N``.
@@ -19,7 +19,7 @@ class EpisodeStatistics:
         self.lengths = torch.zeros(num_envs)
 
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Add trajectories ``(N, T)``; give return and length of each of the ``E`` episodes that ended, ``(E,)``."""
+        """Add trajectories ``(N, T)``; return the return and length of each of the ``E`` ended episodes, ``(E,)``."""
         ended_returns, ended_lengths = [], []
         rewards, dones = task_reward(batch["next"]).squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
@@ -32,9 +32,9 @@ class EpisodeStatistics:
         return torch.cat(ended_returns), torch.cat(ended_lengths)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the sums of the episodes under way."""
+        """Return the sums of the unfinished episodes."""
         return {"returns": self.returns, "lengths": self.lengths}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.returns, self.lengths = state["returns"].clone(), state["lengths"].clone()

@@ -10,14 +10,14 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl_mcp.training.run_folder import METRICS, flush, replacing
 
 CSV_LOGGER = "csv/scalars"
-"""Where in a run folder TorchRL's csv logger has its files, of lines ``step,value``."""
+"""Folder of the files of TorchRL's csv logger in a run folder, with lines ``step,value``."""
 
 
 def begin_after(logger: Logger, frames: int) -> None:
-    """Make TensorBoard drop what was logged after environment step ``frames``, by a run that was killed since.
+    """Make TensorBoard drop the values that a killed run logged after environment step ``frames``.
 
-    Other loggers are left alone: the csv logger's files are rewound with ``metrics.csv``, and W&B and MLflow take a
-    resumed run for a new one.
+    Other loggers need no change: the csv logger's files are rewound with ``metrics.csv``, and W&B and MLflow treat a
+    resumed run as a new one.
     """
     if isinstance(logger, TensorboardLogger):
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -27,7 +27,7 @@ def begin_after(logger: Logger, frames: int) -> None:
 
 
 class MetricsWriter:
-    """A writer of one row of metrics per iteration, to ``metrics.csv`` and to loggers.
+    """Writes one row of metrics per iteration to ``metrics.csv`` and to loggers.
 
     Args:
         folder: The run folder.
@@ -40,16 +40,16 @@ class MetricsWriter:
         self._columns: list[str] = []
 
     def write(self, metrics: Mapping[str, float], *, step: int) -> None:
-        """Append ``metrics``, which hold the same names every time, at environment step ``step``.
+        """Append ``metrics``, with the same names in every call, at environment step ``step``.
 
         Raises:
-            FileNotFoundError: If somebody has removed the file since the last row.
+            FileNotFoundError: If the file was removed since the last row.
         """
         new = not self._columns
         if new:
             self._columns = list(metrics)
         elif not self.path.exists():
-            raise FileNotFoundError(f"{self.path} is gone, and with it what the run has written")
+            raise FileNotFoundError(f"{self.path} was removed, with the rows written so far")
         with self.path.open("a", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             if new:
@@ -59,19 +59,19 @@ class MetricsWriter:
             logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)
 
     def flush(self) -> None:
-        """Make the system write what it holds back of the file to the disk.
+        """Flush the file to the disk.
 
         Raises:
-            FileNotFoundError: If somebody has removed the file since the last row.
+            FileNotFoundError: If the file was removed since the last row.
         """
         if self._columns:
             flush(self.path)
 
     def rewind(self, iteration: int) -> None:
-        """Drop the rows after ``iteration``, which a run wrote that was killed before its next checkpoint.
+        """Drop the rows after ``iteration``, written by a run that was killed before its next checkpoint.
 
         Raises:
-            ValueError: If there are no rows up to there.
+            ValueError: If the rows end before ``iteration``.
         """
         kept = [row for row in self._rows() if int(row["iteration"]) <= iteration]
         if (last := int(kept[-1]["iteration"]) if kept else 0) < iteration:
@@ -81,7 +81,7 @@ class MetricsWriter:
             )
         if not self.path.exists():
             return
-        # Without rows the header may be cut short as well: the next row writes it anew.
+        # Without rows, even the header may be incomplete: the next row writes it again.
         self._columns = list(kept[0]) if kept else []
         with replacing(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
@@ -91,7 +91,7 @@ class MetricsWriter:
         self._rewind_csv_logger(int(kept[-1]["frames"]) if kept else 0)
 
     def _rewind_csv_logger(self, frames: int) -> None:
-        """Drop what TorchRL's csv logger, which appends to its files, has written after environment step ``frames``."""
+        """Drop the lines that TorchRL's csv logger, which only appends, wrote after environment step ``frames``."""
         for path in (self.path.parent / CSV_LOGGER).rglob("*.csv"):
             lines = path.read_text(errors="replace").splitlines(keepends=True)
             pairs = [line for line in lines if line.partition(",")[0].isdecimal() and line.endswith("\n")]
@@ -99,7 +99,7 @@ class MetricsWriter:
                 partial.write_text("".join(line for line in pairs if int(line.partition(",")[0]) <= frames))
 
     def _rows(self) -> list[dict[str, str]]:
-        """Return all whole rows that number their iteration."""
+        """Return all complete rows with a number of iteration."""
         if not self.path.exists():
             return []
         with self.path.open(newline="", errors="replace") as file:

@@ -1,19 +1,18 @@
-"""Whether networks run in bfloat16 or in float32: whichever the machine computes faster.
+"""The precision of networks, bfloat16 or float32: whichever is faster on the machine.
 
-``autocast=auto`` decides once, when a run begins, and the run keeps the choice. What torch says of the device decides
-where it is certain:
+``autocast=auto`` chooses once, when a run begins, and the run keeps the choice. It depends on the device:
 
 =================================================  ==================================================
 device                                             choice
 =================================================  ==================================================
 x86 processor with AMX tiles of bfloat16           bfloat16
-x86 processor with neither AMX nor AVX512-BF16     float32: oneDNN would emulate it
+x86 processor with neither AMX nor AVX512-BF16     float32: oneDNN would emulate bfloat16
 CUDA or ROCm device                                bfloat16 from compute capability 8 (Ampere) on
-every other                                        by timing one matrix product in both
+any other                                          the faster one for a timed matrix product
 =================================================  ==================================================
 
-AVX512-BF16 alone is timed as well: some processors that have it compute bfloat16 at twice the rate of float32 and
-others at half of it. So are processors by Arm, where the answer depends on how torch was built.
+This includes x86 processors with AVX512-BF16 alone, some of which compute bfloat16 at twice the rate of float32 and
+others at half of it, and Arm processors, where the speed depends on the build of torch.
 """
 
 import time
@@ -24,31 +23,31 @@ from statistics import median
 import torch
 
 ADVANTAGE = 0.8
-"""Largest time of a product in bfloat16, relative to float32, at which the lower precision is worth having."""
+"""Largest time of a product in bfloat16, relative to float32, at which bfloat16 is chosen."""
 SHAPE = (256, 1024, 1024)
-"""Rows, inputs and outputs of the product that is timed: a small batch in a wide layer."""
+"""Rows, inputs and outputs of the timed product: a small batch in a wide layer."""
 REPEATS = 5
 
 
 @dataclass(frozen=True)
 class Precision:
-    """What a run's networks compute in.
+    """The precision of a run's networks.
 
     Attributes:
         autocast: Whether matrix products are in bfloat16.
-        reason: Why, in a few words.
+        reason: Short reason for the choice.
     """
 
     autocast: bool
     reason: str
 
     def __str__(self) -> str:
-        """Return the precision and the reason, as logs show them."""
+        """Return the precision and the reason, for logs."""
         return f"networks in {name(self.autocast)}: {self.reason}"
 
 
 def name(autocast: bool) -> str:
-    """Return what the precision is called."""
+    """Return the name of the precision."""
     return "bfloat16" if autocast else "float32"
 
 
@@ -56,8 +55,8 @@ def choose(autocast: bool | str, device: torch.device | str) -> Precision:
     """Return the precision of networks on a device, and warn if bfloat16 is asked for and slower.
 
     Args:
-        autocast: True or False to have it so, or ``auto`` for the faster.
-        device: Where the networks are.
+        autocast: True for bfloat16, False for float32, or ``auto`` for the faster.
+        device: Device of the networks.
 
     Raises:
         ValueError: If ``autocast`` is anything else.
@@ -82,7 +81,7 @@ def choose(autocast: bool | str, device: torch.device | str) -> Precision:
 
 
 def is_native(device: torch.device | str) -> bool | None:
-    """Tell whether a device multiplies matrices of bfloat16 faster than of float32, None where torch does not say."""
+    """Return whether a device multiplies bfloat16 matrices faster than float32 matrices, None if torch cannot tell."""
     kind = torch.device(device).type
     if kind == "cuda":
         with torch.cuda.device(device):
@@ -98,11 +97,11 @@ def is_native(device: torch.device | str) -> bool | None:
 
 
 def relative_time(device: torch.device | str) -> float:
-    """Return the time of a matrix product in bfloat16, relative to float32, on one thread of a processor."""
+    """Return the time of a matrix product in bfloat16 relative to float32, on a CPU with one thread."""
     rows, inputs, outputs = SHAPE
     operands = torch.ones(rows, inputs, device=device), torch.ones(outputs, inputs, device=device)
     num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # another run may have the other cores
+    torch.set_num_threads(1)  # another run may use the other cores
     try:
         low, full = (_seconds(*(x.to(dtype) for x in operands)) for dtype in (torch.bfloat16, torch.float32))
     finally:
@@ -111,7 +110,7 @@ def relative_time(device: torch.device | str) -> float:
 
 
 def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
-    """Return the median time of ``rows @ weight.T``, after a first one that prepares the kernels."""
+    """Return the median time of ``rows @ weight.T`` in seconds, after a first product that prepares the kernels."""
     times = []
     for _ in range(1 + REPEATS):
         _wait(rows.device)
@@ -123,7 +122,7 @@ def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
 
 
 def _wait(device: torch.device) -> None:
-    """Wait until an accelerator has done what it was given."""
+    """Wait until an accelerator has finished its work."""
     if device.type != "cpu":
         torch.accelerator.synchronize(device)
 

@@ -1,4 +1,4 @@
-"""The progress of a run, and the time of its sections."""
+"""The progress of a run, and a stopwatch for its sections."""
 
 import time
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ class Progress:
 
 @dataclass
 class Stopwatch:
-    """Wall-clock seconds by section. Time that belongs to none is overhead."""
+    """Wall-clock seconds by section. Time outside all sections is overhead."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -40,7 +40,7 @@ class Stopwatch:
         self.add(section, time.perf_counter() - start)
 
     def add(self, section: str, seconds: float) -> None:
-        """Add to a section."""
+        """Add seconds to a section."""
         self.seconds[section] = self.seconds.get(section, 0.0) + seconds
 
     def watch(self, section: str, module: nn.Module) -> None:

@@ -1,9 +1,9 @@
 """Ray's agents: they end with the process that started Ray.
 
-On Linux the kernel ends Ray's servers with the process that started them. Their agents notice at once, but then wait a
-minute for a server to report that to (``ray._private.utils.publish_error_to_driver``, whose 60 seconds no setting
-changes). Run as a script, which imports nothing of the library, this module waits with them and ends them. Elsewhere
-Ray does so itself.
+On Linux the kernel ends Ray's servers together with the process that started them. Ray's agents notice at once, but
+wait a minute for a server to report to (``ray._private.utils.publish_error_to_driver``, whose 60 seconds no setting
+changes). This module, run as a script without imports from the library, ends them sooner. On other systems Ray ends
+them itself.
 """
 
 import os
@@ -17,22 +17,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 SERVER = "raylet"
-"""The process whose children are the agents and workers."""
+"""Name of the parent process of agents and workers."""
 
 INTERVAL = 2.0
-"""Seconds between looks for new ones."""
+"""Seconds between searches for new agents."""
 
 GRACE = 3.0
-"""Seconds that they have to end by themselves."""
+"""Seconds that agents get to end by themselves."""
 
 
 @contextmanager
 def watched() -> Iterator[None]:
-    """End the children of the Ray server that the block starts when the block, or this process, has ended."""
+    """When the block or this process ends, end the children of the Ray server that the block started."""
     if not hasattr(os, "pidfd_open"):
         yield
         return
-    # In a session of its own, because an interrupt goes to all processes of this one's.
+    # In a new session, because an interrupt reaches all processes of this session.
     watcher = subprocess.Popen([sys.executable, __file__], stdin=subprocess.PIPE, start_new_session=True)
     assert watcher.stdin is not None
     try:
@@ -43,12 +43,12 @@ def watched() -> Iterator[None]:
 
 
 def watch(parent: int, pipe: int) -> None:
-    """Wait until ``pipe`` is closed, which its other end is by the death of ``parent``; then end what it has left."""
+    """Wait until ``pipe`` closes, at the latest when ``parent`` ends; then end the agents that ``parent`` left."""
     found: dict[int, int] = {}
     while not select.select([pipe], [], [], INTERVAL)[0]:
         for agent in _agents(parent) - found.keys():
             with suppress(ProcessLookupError):
-                found[agent] = os.pidfd_open(agent)  # stands for this process alone, whoever gets its number later
+                found[agent] = os.pidfd_open(agent)  # stays valid for this process if its number is reused
     deadline = time.monotonic() + GRACE
     for descriptor in found.values():
         select.select([descriptor], [], [], max(deadline - time.monotonic(), 0.0))
@@ -57,7 +57,7 @@ def watch(parent: int, pipe: int) -> None:
 
 
 def _agents(parent: int) -> set[int]:
-    """Return the children of the Ray server that ``parent`` has started."""
+    """Return the children of the Ray server that ``parent`` started."""
     processes = [found for path in Path("/proc").glob("[0-9]*/stat") if (found := _process(path))]
     servers = {process for process, name, of in processes if (name, of) == (SERVER, parent)}
     return {process for process, _, of in processes if of in servers}

@@ -33,27 +33,27 @@ CHECKPOINTS = "checkpoints"
 """The folder of checkpoints."""
 
 CHECKPOINT = "checkpoint-{:012d}.torchrl"
-"""Of a checkpoint file, by environment steps, as TorchRL's rotation has it."""
+"""Name of a checkpoint file by environment steps, in the form of TorchRL's rotation."""
 
 PARTIAL = ".partial"
-"""At the end of the name of a file that is being written."""
+"""Suffix of the name of a file that is being written."""
 
 UNPACKED = "torchrl-checkpoint-load-*"
 """Folders into which TorchRL unpacks checkpoints to read them, in the system's folder for temporary files."""
 
 LARGEST = 2**24
-"""Bytes of a JSON file that is read. One of a run has some thousand."""
+"""Most bytes of a JSON file. A run's has a few thousand."""
 
 STALE = 3600.0
-"""Seconds after which nobody reads a checkpoint any more."""
+"""Seconds after which no process can still be reading a checkpoint."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Replace a file in one step: the block writes to the path that it is given, which then becomes ``path``.
+    """Replace a file atomically: the block writes to a temporary path, which then becomes ``path``.
 
-    Readers find the old content or the new one and nothing between, also after a crash or a power failure: content
-    and folder are flushed to the disk. If the block fails, the old file stays. Missing folders are made.
+    Readers find either the old content or the new, also after a crash or a power failure: content and folder are
+    flushed to the disk. If the block fails, the old file stays. Missing folders are created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}{PARTIAL}")
@@ -73,11 +73,11 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Raises:
         ValueError: If it is damaged, too large or nested too deeply, or holds no object.
-        OSError: If it cannot be read.
+        OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
         raise ValueError(f"it has more than {LARGEST} bytes")
@@ -91,7 +91,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's ``metrics.csv``; blank is NaN, and a row half written is left out."""
+    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete row is left out."""
     path = run / METRICS
     if not path.exists():
         return []
@@ -104,28 +104,28 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
 
 
 def find_all(run: Path) -> list[Path]:
-    """Return the checkpoint files of a run folder that training wrote, the newest first."""
-    # By name alone: TorchRL's rotation passes over what it cannot read, and an older checkpoint would be a surprise.
+    """Return the checkpoint files that training wrote to a run folder, newest first."""
+    # By name alone: TorchRL's rotation skips unreadable files, and an older checkpoint would be a surprise.
     return sorted(
         (path for path in (run / CHECKPOINTS).glob("checkpoint-*.torchrl") if frames(path) >= 0), reverse=True
     )
 
 
 def frames(path: Path) -> int:
-    """Return after how many environment steps the checkpoint file ``path`` of a run folder was written.
+    """Return the environment steps in the name of a checkpoint file, -1 if there are none.
 
-    That of another file, such as a copy ``checkpoint-best.torchrl``, is -1.
+    A copy such as ``checkpoint-best.torchrl`` has none.
     """
     step = path.stem.removeprefix("checkpoint-")
     return int(step) if step.isdecimal() else -1
 
 
 def remove_leftovers(run: Path) -> None:
-    """Remove what processes that were killed left of files that they wrote, and of checkpoints that they read.
+    """Remove unfinished files of killed processes, and checkpoints that they unpacked.
 
-    Nobody else may be at work on the run.
+    No other process may be working on the run.
     """
-    # TorchRL hides what it has not finished.
+    # TorchRL hides its unfinished files.
     unfinished = [*(run / CHECKPOINTS).glob(".*"), *run.rglob(f"*{PARTIAL}")]
     stale = [path for path in Path(tempfile.gettempdir()).glob(UNPACKED) if _age(path) > STALE]
     for path in unfinished + stale:
@@ -136,7 +136,7 @@ def remove_leftovers(run: Path) -> None:
 
 
 def _age(path: Path) -> float:
-    """Return the seconds since a file was changed, 0 if it is gone."""
+    """Return the seconds since a file was changed, 0 if it no longer exists."""
     try:
         return time.time() - path.stat().st_mtime
     except FileNotFoundError:
@@ -144,7 +144,7 @@ def _age(path: Path) -> float:
 
 
 def flush(path: Path) -> None:
-    """Make the system write a file, or the entries of a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""How torch's threads are shared out."""
+"""Control of torch's threads."""
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 @contextmanager
 def threads(number: int) -> Iterator[None]:
-    """Give torch ``number`` threads on the CPU, and afterwards as many as before."""
+    """Let torch use ``number`` threads on the CPU while the block runs."""
     before = torch.get_num_threads()
     torch.set_num_threads(number)
     try:
@@ -22,16 +22,16 @@ def threads(number: int) -> Iterator[None]:
 
 
 def side_by_side(tasks: Mapping[str, Callable[[], Result]]) -> dict[str, Result]:
-    """Do tasks at the same time, each with its share of torch's threads, or in turn where there are not enough.
+    """Run tasks in parallel, each with its share of torch's threads, or in turn if there are too few threads.
 
-    A thread of its own for each of two networks beats two threads for every matrix product: neither waits for the other
-    at each operation, and what Python does for one is done beside the products of the other.
+    One thread for each of two networks is faster than two threads for every matrix product: the networks do not wait
+    for each other at each operation, and Python's work for one overlaps with the products of the other.
 
     Args:
-        tasks: What to do, by name. Tasks share nothing that one of them changes, and draw no random numbers.
+        tasks: Functions by name. They draw no random numbers and change no shared data.
 
     Returns:
-        What each returns.
+        The result of each task, by name.
     """
     share = torch.get_num_threads() // len(tasks)
     if share < 1 or len(tasks) == 1:

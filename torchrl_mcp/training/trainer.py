@@ -37,7 +37,7 @@ class Estimator(Protocol):
     out_keys: Sequence[NestedKey]
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return the samples to learn from, with ``out_keys``, of trajectories ``(N, T)``."""
+        """Return the samples to learn from, with ``out_keys``, for trajectories ``(N, T)``."""
         ...
 
 
@@ -45,28 +45,28 @@ class Trainer:
     """Policy optimisation of an actor and a critic.
 
     Args:
-        source: Where trajectories come from, of ``N`` environments.
+        source: Source of trajectories of ``N`` environments.
         parts: All parts of the agent by name.
         actor: The actor over those parts.
         critic: The value function over those parts.
-        losses: What each of ``optimizers`` minimises, by its name: the sum of the outputs that begin with ``loss_``.
-        advantages: From trajectories ``(N, T)`` to the samples to learn from, of any batch shape, with the keys
-            ``advantages.out_keys`` that the losses read beside what the policy stores.
-        optimizers: Optimisers of all that is trained: of the ``critic``, and of the ``actor`` unless it is frozen.
+        losses: Losses by the names of ``optimizers``: each minimises the sum of the outputs that begin with ``loss_``.
+        advantages: From trajectories ``(N, T)`` to samples of any batch shape, with the keys ``advantages.out_keys``
+            that the losses read in addition to the policy's stored keys.
+        optimizers: Optimisers of the ``critic`` and, unless it is frozen, the ``actor``.
         frozen: Parts that must not change, checked in every iteration.
-        metrics_writer: Where metrics go.
-        checkpoints: Where checkpoints go.
+        metrics_writer: Writer of metrics.
+        checkpoints: Rotation of checkpoints.
         config: The run's configuration, JSON-compatible, kept in every checkpoint.
         total_frames: Environment steps of the run.
         frames_per_batch: Environment steps per iteration, ``N * T``.
         minibatch_size: Samples per gradient step.
         num_epochs: Passes over each batch.
-        warmup_batches: Batches at the beginning to which normalisers and critic are fitted while the actor waits: its
-            first step is then taken with inputs of unit variance and with advantages that mean something.
+        warmup_batches: First batches, which train only normalisers and critic, so that the actor's first step has
+            inputs of unit variance and meaningful advantages.
         max_grad_norm: Largest gradient norm, of actor and critic each, or None to leave gradients as they are.
         step_size_schedule: Adapts the actor's step size to the KL divergence of each update, or None.
-        autocast: Run all networks in bfloat16 autocast, in source and loss alike.
-        device: Where the networks are.
+        autocast: Run all networks in bfloat16 autocast, both in the source and in the losses.
+        device: Device of the networks.
         checkpoint_interval: Iterations between checkpoints.
         progress_bar: Show the progress on standard error.
 
@@ -132,7 +132,7 @@ class Trainer:
         )
 
     def run(self) -> None:
-        """Train until ``total_frames``, saving as it goes."""
+        """Train until ``total_frames``, with checkpoints."""
         self.source.start(
             self._behaviour(),
             frames_per_batch=self.frames_per_batch,
@@ -146,11 +146,11 @@ class Trainer:
             self.source.stop()
 
     def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``; where the trajectory source is all in it, to the same numbers.
+        """Continue from the checkpoint file ``path``, bit for bit if it holds the whole state of the trajectory source.
 
         Raises:
-            ValueError: If the file is damaged or belongs to another configuration, or ``metrics.csv`` does not reach as
-                far; nothing has been written then.
+            ValueError: If the file is damaged or belongs to another configuration, or ``metrics.csv`` ends before it;
+                nothing is written then.
         """
         load(self.checkpoint, path)
         if not self.source.resumes_episodes:
@@ -159,7 +159,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint."""
-        self.metrics_writer.flush()  # a checkpoint without the rows before it would be of no use
+        self.metrics_writer.flush()  # a run cannot resume from a checkpoint without the rows before it
         save(self.checkpoint, self.checkpoints, step=self.progress.frames, config=self.config)
 
     def _loop(self) -> None:
@@ -183,15 +183,15 @@ class Trainer:
                 bar.advance(batch.numel(), metrics[NORMALISED_RETURN])
 
     def _behaviour(self) -> TensorDictModuleBase:
-        """Return the policy as it collects: what it writes is what the loss reads, and no more."""
+        """Return the policy for collection, which writes only the keys that the loss reads."""
         kept = {"action", self.actor.log_prob, *self.actor.stored}
         keys = [key for key in dict.fromkeys(self.actor.policy.out_keys) if key in kept]
         return TensorDictSequential(self.actor.policy, selected_out_keys=keys)
 
     def _update(self, samples: TensorDictBase, warming_up: bool) -> dict[str, float]:
-        """Take ``num_epochs`` passes of gradient steps over samples; give the mean of everything the loss reports.
+        """Take gradient steps in ``num_epochs`` passes over samples; return the means of the losses' outputs.
 
-        While ``warming_up`` the actor waits, and reports its loss alone.
+        While ``warming_up``, the actor does not learn and only reports its loss.
         """
         keys = ["observation", "goal", self.actor.sampled, self.actor.log_prob, *self.actor.stored]
         samples = samples.select(*keys, *self.advantages.out_keys).flatten()
@@ -200,7 +200,7 @@ class Trainer:
         learning = {name: partial(self._learn, name, samples, minibatches) for name in self.optimizers}
         if warming_up and "actor" in learning:
             learning["actor"] = partial(self._wait, samples[minibatches[0]])
-        # Actor and critic share nothing but samples: on a CPU they learn at the same time.
+        # Actor and critic share only the samples: on a CPU they learn in parallel.
         reports = side_by_side(learning) if self.device.type == "cpu" else {name: f() for name, f in learning.items()}
         metrics = {f"loss/{key}": value for report in reports.values() for key, value in _mean(report).items()}
         if "actor" in reports:
@@ -215,7 +215,7 @@ class Trainer:
         return metrics | self._networks(samples[: self.minibatch_size])
 
     def _networks(self, samples: TensorDictBase) -> dict[str, float]:
-        """Tell how much the policy explores and how many units of the networks are dead, by samples ``(B,)``."""
+        """Return metrics of exploration and of dead units, from samples ``(B,)``."""
         metrics: dict[str, float] = {}
 
         def evaluate() -> None:
@@ -226,7 +226,7 @@ class Trainer:
             return self.dead_units(evaluate) | metrics
 
     def _learn(self, name: str, samples: TensorDictBase, minibatches: Sequence[Tensor]) -> list[TensorDictBase]:
-        """Take a gradient step of the optimiser of that name on every minibatch; give what its loss reports."""
+        """Take a gradient step of the named optimiser on every minibatch; return the outputs of its loss."""
         reports: list[TensorDictBase] = []
         for index in minibatches:
             with self._precision():
@@ -237,7 +237,7 @@ class Trainer:
 
     @torch.no_grad()
     def _wait(self, samples: TensorDictBase) -> list[TensorDictBase]:
-        """Give what the actor's loss reports of samples that a policy with the normalisers of now would have drawn."""
+        """Return the outputs of the actor's loss with log-probabilities under the current normalisers."""
         with self._precision():
             distribution = self.actor.trained.get_dist(samples)
             samples[self.actor.log_prob] = distribution.log_prob(samples[self.actor.sampled])
@@ -245,7 +245,7 @@ class Trainer:
         return [report.set("actor_grad_norm", torch.zeros((), device=self.device))]
 
     def _step(self, optimizer: Optimizer) -> Tensor:
-        """Clip the gradient, step, and give the norm that it had."""
+        """Clip the gradient, take a step, and return the norm before clipping."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         optimizer.step()
@@ -261,7 +261,7 @@ class Trainer:
                 )
 
     def _update_normalisers(self, batch: TensorDictBase) -> None:
-        """Merge the batch into the input statistics, after the actor's update: source and loss have to see the same."""
+        """Merge the batch into the input statistics: after the update, so that source and loss use the same ones."""
         for key in ("observation", "goal"):
             if (name := f"{key}_normaliser") not in self.frozen:
                 cast("RunningNormaliser", self.parts[name]).update(batch[key])
@@ -279,7 +279,7 @@ class Trainer:
         }
 
     def _task_metrics(self, batch: TensorDictBase) -> dict[str, float]:
-        """Mean of all that the task observes for the record."""
+        """Return the means of the task's metrics."""
         metrics: dict[str, float] = {}
         for key, names in self.source.env.metric_names.items():
             means = batch["next", key].float().flatten(0, -2).mean(0)
@@ -287,7 +287,7 @@ class Trainer:
         return metrics
 
     def _advance(self, metrics: dict[str, float], seconds: float) -> None:
-        """Count, record, and save if it is time."""
+        """Count the iteration, write its metrics, and save a checkpoint if due."""
         progress = self.progress
         progress.iteration += 1
         progress.frames += self.frames_per_batch
@@ -301,19 +301,19 @@ class Trainer:
             self.save()
 
     def _precision(self) -> torch.autocast:
-        # Entered anew for every use: within one context autocast keeps its copies of the weights.
+        # A new context for every use: within one, autocast reuses its outdated copies of the weights.
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast)
 
 
 def _spread(distribution: Distribution) -> dict[str, float]:
-    """How much a policy explores."""
+    """Return a measure of exploration."""
     if isinstance(distribution, Categorical):
         return {"policy/entropy": distribution.entropy().mean().item()}
     return {"policy/std": distribution.stddev.mean().item()}
 
 
 def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
-    """Average scalars over reports of the same keys, and fetch them from the device all at once."""
+    """Average scalars over reports with the same keys, with one transfer from the device."""
     keys = list(reports[0].keys())
     means = torch.stack([torch.stack([report[key] for report in reports]).mean() for key in keys])
     return dict(zip(keys, means.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Transfer: the parts that a method keeps, freezes and initialises anew on a new task (Algorithm 1)."""
+"""Transfer: the parts that a method keeps, freezes and re-initialises for a new task (Algorithm 1)."""
 
 import hashlib
 from collections.abc import Collection, Iterable
@@ -8,11 +8,11 @@ from torch import nn
 
 
 class FrozenParts:
-    """Parts that training must not change, with a check that it did not.
+    """Parts that training must not change, with a check of their bits.
 
     Args:
         parts: All parts of an agent by name.
-        names: Those to freeze: their parameters no longer require gradients, and normalisers among them stop updating.
+        names: Parts to freeze: their parameters require no gradients, and normalisers among them stop updating.
 
     Raises:
         ValueError: If a name is not a part.
@@ -24,22 +24,22 @@ class FrozenParts:
         self.fingerprints = {name: fingerprint(module) for name, module in self.modules.items()}
 
     def __contains__(self, name: str) -> bool:
-        """Tell whether a part is frozen."""
+        """Return whether a part is frozen."""
         return name in self.modules
 
     def state_dict(self) -> dict[str, str]:
-        """Return the fingerprints, so that a continued run is checked against those it began with."""
+        """Return the fingerprints, so that a resumed run is checked against its first ones."""
         return dict(self.fingerprints)
 
     def load_state_dict(self, state: dict[str, str]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore the result of :meth:`state_dict`."""
         self.fingerprints = dict(state)
 
     def verify(self) -> None:
-        """Check that no frozen part has changed by a bit since it was frozen.
+        """Check that no bit of a frozen part has changed.
 
         Raises:
-            RuntimeError: If one has.
+            RuntimeError: If a part has changed.
         """
         for name, module in self.modules.items():
             if fingerprint(module) != self.fingerprints[name]:

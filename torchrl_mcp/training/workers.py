@@ -1,10 +1,11 @@
-"""Worker processes: they live while they are needed, and their end is noticed."""
+"""Worker processes: detecting workers that died, ending them, and ending workers whose parent died."""
 
 import multiprocessing
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -14,13 +15,13 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 INTERVAL = 0.5
-"""Seconds between looks at the workers."""
+"""Seconds between checks of the workers."""
 
 
 def attend(task: Callable[[], Result], workers: Sequence[BaseProcess]) -> Result:
-    """Return what ``task`` returns, which waits for ``workers``, unless one of them ends.
+    """Return the result of ``task``, which waits for ``workers``, or fail as soon as one of them ends.
 
-    The task runs in a thread, because what waits for a dead worker may wait for ever.
+    The task runs in a thread, because it may wait forever for a dead worker.
 
     Raises:
         ChildProcessError: If a worker ends.
@@ -39,7 +40,7 @@ def attend(task: Callable[[], Result], workers: Sequence[BaseProcess]) -> Result
 
 @contextmanager
 def new_workers() -> Iterator[list[BaseProcess]]:
-    """Give a list to which the processes are added that the block starts; if the block fails, they are ended."""
+    """Yield a list, to which the processes that the block starts are added; if the block fails, end them."""
     others = set(multiprocessing.active_children())
     workers: list[BaseProcess] = []
     try:
@@ -51,7 +52,7 @@ def new_workers() -> Iterator[list[BaseProcess]]:
 
 
 def end(workers: Sequence[BaseProcess]) -> None:
-    """End those of ``workers`` that still live."""
+    """End the ``workers`` that are still alive."""
     living = [process for process in multiprocessing.active_children() if process in workers]
     for process in living:
         process.kill()
@@ -60,12 +61,21 @@ def end(workers: Sequence[BaseProcess]) -> None:
 
 
 def end_with_parent() -> None:
-    """Make this process end with the one that started it, however that ends, and leave interrupts to that one."""
+    """End this process as soon as its parent has ended, for any reason, and leave interrupts to the parent."""
     if multiprocessing.parent_process() is None:
         return
-    # An interrupt goes to parent and children alike; the parent decides what it means.
+    # An interrupt goes to parent and children alike; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def end_with_parent_while_starting() -> None:
+    """End a process that ``multiprocessing`` is spawning as soon as its parent has ended, even during its imports.
+
+    The imports of a worker take seconds, and :func:`end_with_parent` is called after them. No effect on Windows.
+    """
+    if "--multiprocessing-fork" in sys.orig_argv and sys.platform != "win32":
+        threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
 
 
 def _started_beside(others: set[BaseProcess]) -> list[BaseProcess]:
@@ -77,6 +87,12 @@ def _follow_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    os._exit(1)
+
+
+def _follow(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(INTERVAL)
     os._exit(1)
 
 
@@ -100,7 +116,7 @@ def _require_alive(workers: Sequence[BaseProcess]) -> None:
 
 
 def _exit_code(process: BaseProcess) -> int | None:
-    """Return how a process ended, or None if it lives or TorchRL, which saw another one end, has ended it."""
+    """Return the exit code of a process, or None if it is alive, or if TorchRL closed it after another one ended."""
     try:
         return process.exitcode
     except ValueError:

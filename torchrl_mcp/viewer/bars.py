@@ -11,12 +11,12 @@ ROW, LENGTH = 1 / 22, 1 / 4
 
 
 def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> None:
-    """Draw numbered bars into the upper left corner, as long as weights from 0 to 1, each on a track of length 1.
+    """Draw weights as numbered bars into the upper left corner, each on a track for weight 1.
 
     Args:
-        picture: An RGB picture, which is changed.
-        weights: From 0 to 1, of primitives 1, 2, ...
-        title: What they are.
+        picture: RGB picture, changed in place.
+        weights: Weights of primitives 1, 2, ..., from 0 to 1.
+        title: Title of the bars.
     """
     draw, row, length = ImageDraw.Draw(picture), round(picture.height * ROW), round(picture.height * LENGTH)
     font = ImageFont.load_default(0.8 * row)

@@ -17,31 +17,29 @@ from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.viewer.bars import draw_bars
+from torchrl_mcp.viewer.formats import ENCODER, EVERY, require_format
 from torchrl_mcp.viewer.player import Player
 
-EVERY = {".gif": 2, ".mp4": 1}
-"""Control steps per picture, by the file's suffix."""
-
 AZIMUTH, ELEVATION = 115.0, -26.0
-"""Degrees. Who walks along x is seen from the right and a little from the front, and no horizon is in sight."""
+"""Camera angles in degrees: a character walking along x is seen from the right, a little from the front and above."""
 
 DISTANCE = 2.8
-"""Of the camera, in extents of the character."""
+"""Distance of the camera, in extents of the character."""
 
 LAG = 0.25
-"""Seconds by which the camera is behind what it follows."""
+"""Time constant in seconds with which the camera follows the character."""
 
 
 def film(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
-    """Play, and draw the character, what its task is about, and the weights of its primitives.
+    """Play, and draw the character, the target or reference of its task, and the weights of its primitives.
 
-    The camera follows smoothly, and cuts where an episode begins.
+    The camera follows smoothly, and cuts when an episode begins.
 
     Args:
-        player: Whom to film.
-        seconds: Duration.
-        width: Pixels.
-        height: Pixels.
+        player: The player to film.
+        seconds: Duration in seconds.
+        width: Width in pixels.
+        height: Height in pixels.
         every: Control steps per picture.
 
     Yields:
@@ -56,7 +54,7 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
     camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
     camera.view.lookat = player.data.subtree_com[1]
-    fixed = model.light_bodyid == 0  # such lights come along, for shadows are drawn near where they shine
+    fixed = model.light_bodyid == 0  # fixed lights move with the character, because shadows are drawn only near them
     try:
         for step in range(round(seconds / timestep)):
             player.step()
@@ -74,9 +72,9 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
 
 
 def followed(place: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
-    r"""Return where the camera looks a while later, each ``(3,)``: :math:`x + (1 - e^{-t / \tau}) (x^* - x)`.
+    r"""Return the camera's next focus from its last and its target, ``(3,)``: :math:`x + (1 - e^{-t/\tau}) (x^* - x)`.
 
-    A target of constant velocity v it follows at the distance :math:`v \tau`, with :math:`\tau` :data:`LAG`.
+    It stays :math:`v \tau` behind a target of constant velocity v, with :math:`\tau` :data:`LAG`.
     """
     return place + (1 - math.exp(-seconds / LAG)) * (target - place)
 
@@ -96,23 +94,21 @@ def save_film(
     """Write :func:`film` as an animated GIF or an MP4 that plays at the speed of the simulation.
 
     Args:
-        policy: From what the environment shows to ``action``, on the CPU.
-        env: Environments, of which the first is filmed; an episode that ends is followed by another.
+        policy: From the environment's observations to ``action``, on the CPU.
+        env: Environments, of which the first is filmed; when an episode ends, the next begins.
         path: The file, ``.gif`` or ``.mp4``.
-        seconds: Duration.
-        width: Pixels.
-        height: Pixels.
+        seconds: Duration in seconds.
+        width: Width in pixels.
+        height: Height in pixels.
         deterministic: Play the deterministic action rather than a sample.
-        num_options: Number of options among which the policy chooses, 0 if it does not.
-        aside: How far beside the character to draw a ghost, in units of the character's extent.
+        num_options: Number of options of the policy, 0 without options.
+        aside: Distance of a ghost from the character, in extents of the character.
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
-        ValueError: If an argument is out of range, the file's suffix is another, or it is ``.mp4`` and what writes
-            that is not installed.
+        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.viewer.formats.require_format`.
     """
-    if path.suffix not in EVERY:
-        raise ValueError(f"{path} is not the name of a film: end it with .gif or .mp4")
+    require_format(path)
     save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
     path.parent.mkdir(parents=True, exist_ok=True)
     player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
@@ -134,15 +130,8 @@ def _counted(pictures: Iterable[Image.Image], shown: tqdm) -> Iterator[Image.Ima
 
 
 def save_mp4(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
-    """Write RGB pictures as an MP4 (H.264), one every ``interval`` seconds.
-
-    Raises:
-        ValueError: If imageio-ffmpeg is not installed.
-    """
-    try:
-        ffmpeg = import_module("imageio_ffmpeg")
-    except ImportError as error:
-        raise ValueError(f"{path} needs imageio-ffmpeg: pip install 'torchrl-mcp[video]', or write a .gif") from error
+    """Write RGB pictures as an MP4 (H.264), one every ``interval`` seconds; needs imageio-ffmpeg."""
+    ffmpeg = import_module(ENCODER)
     writer = None
     for picture in pictures:
         if writer is None:

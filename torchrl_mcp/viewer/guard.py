@@ -1,7 +1,7 @@
-"""Who reaches the web server of MuJoCo Studio: this machine alone, unless told otherwise, and no page of another site.
+"""Access control for MuJoCo Studio's web server: by default this machine alone, and never pages of other sites.
 
-Studio listens on every interface, gives whoever comes first control of the simulation, loads the models that they
-upload, and has no setting for any of it (MuJoCo 3.17). Here its server is told where to listen, and asks first.
+Studio listens on every interface, lets the first visitor control the simulation, loads uploaded models, and has no
+setting for any of this (MuJoCo 3.17). This module sets the address to listen on and checks every request.
 """
 
 import socket
@@ -16,10 +16,10 @@ from mujoco.experimental.studio import web_viewer
 from mujoco.experimental.studio.web import web_server
 
 HERE = "127.0.0.1"
-"""This machine alone."""
+"""Address for access from this machine alone."""
 
 CONTROL = ("/ui", "/drop")
-"""Where the server takes input, and files to load."""
+"""Paths on which the server accepts input, and files to load."""
 
 VISITORS = (
     "Everybody who can reach the port sees the simulation, its model and the viewer's log with paths of files. "
@@ -29,7 +29,7 @@ VISITORS = (
 
 @contextmanager
 def guarded(host: str) -> Iterator[None]:
-    """Let viewers that are opened in the block listen at ``host`` alone, and refuse what :func:`refusal` does."""
+    """Let viewers that the block opens listen on ``host`` alone, and check requests with :func:`refusal`."""
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
     web_server.serve = partial(_serve, serve)
@@ -44,12 +44,12 @@ def refusal(path: str, headers: Mapping[str, str], address: str) -> str | None:
     """Return why a request is refused, or None if it is not.
 
     Args:
-        path: What it asks for.
-        headers: Its ``Host``, and its ``Origin`` if a browser sends one.
-        address: Of the machine that it comes from.
+        path: Requested path.
+        headers: Headers ``Host`` and, if a browser sends it, ``Origin``.
+        address: Address of the sender.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
-    if not _is_ours(urlsplit(f"//{host}").hostname or ""):  # a name that a stranger lets point here
+    if not _is_ours(urlsplit(f"//{host}").hostname or ""):  # a stranger's DNS name may resolve to this machine
         return "this address is not the viewer's: use an IP address, or localhost"
     if origin is not None and urlsplit(origin).netloc != host:
         return "pages of other sites may not use the viewer"

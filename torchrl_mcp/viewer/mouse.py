@@ -1,7 +1,7 @@
-"""The left button of the mouse in the web viewer: it drags bodies, and a click on the ground chooses a place.
+"""The left mouse button in the web viewer: it drags bodies, and a click on the ground chooses a place.
 
-Studio drags what was chosen by a double-click before, with a key held and another button. Its functions for that are
-used here.
+In Studio, dragging needs a double-click to select, then a key and another button. This module calls the same functions
+of Studio with the left button.
 """
 
 from collections.abc import Callable
@@ -12,23 +12,23 @@ from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from mujoco.experimental.studio import ux, viewer_protocol
 
 SLACK = 5.0
-"""Pixels by which the mouse may move in a click."""
+"""Largest movement of the mouse during a click, in pixels."""
 
 
 class Mouse:
-    """What the left button does to the scene of a viewer.
+    """Handles the left mouse button in the scene of a viewer.
 
     Args:
-        choose: Told of the place on the ground that was clicked, ``(3,)`` in metres.
+        choose: Called with the clicked point on the ground, ``(3,)`` in metres.
     """
 
     def __init__(self, choose: Callable[[np.ndarray], None]) -> None:
         self._choose = choose
         self._dragging = False
-        self._pressed: tuple[float, float, np.ndarray] | None = None  # on the ground: pixels, and the place
+        self._pressed: tuple[float, float, np.ndarray] | None = None  # press on the ground: pixels, and point
 
     def handle(self, viewer: viewer_protocol.Viewer) -> bool:
-        """Take note of a frame's input; return whether a body is dragged, so that the camera is not."""
+        """Process a frame's input; return whether a body is dragged, in which case the camera must not move."""
         io = imgui.GetIO()
         if self._dragging:
             self._drag(viewer, io)
@@ -44,7 +44,7 @@ class Mouse:
         return self._dragging
 
     def _press(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
-        """Take hold of the body under the mouse if it can move, or note the place on the ground."""
+        """Start dragging the body under the mouse if it can move, or store the point on the ground."""
         model, data, perturb, picked = viewer.model, viewer.data, viewer.perturb, _pick(viewer, io)
         if picked.body == 0:
             self._pressed = io.MousePos.x, io.MousePos.y, np.array(picked.point)
@@ -56,7 +56,7 @@ class Mouse:
             self._dragging = True
 
     def _drag(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
-        """Move what is held, in the vertical plane or with Shift in the horizontal one, or let go of it."""
+        """Drag the body in the vertical plane, or with Shift the horizontal plane, until the button is released."""
         if not imgui.IsMouseDown(imgui.MouseButton.Left):
             viewer.perturb.active, self._dragging = 0, False
             return
@@ -66,7 +66,7 @@ class Mouse:
 
 
 def _pick(viewer: viewer_protocol.Viewer, io: imgui.IO) -> ux.PickResult:
-    """Return what is under the mouse."""
+    """Return the body and point under the mouse."""
     size = io.DisplaySize
     place = io.MousePos.x / size.x, io.MousePos.y / size.y
     return ux.Pick(viewer.model, viewer.data, viewer.camera, *place, size.x / size.y, viewer.vis_options)

@@ -19,8 +19,8 @@ class Weights(NamedTuple):
     """The weight of each primitive.
 
     Args:
-        title: What they are.
-        values: Of the K primitives, from 0 to 1.
+        title: Kind of weights, ``gates`` or ``option``.
+        values: Weights of the K primitives, from 0 to 1.
     """
 
     title: str
@@ -31,18 +31,18 @@ class Player:
     """A policy playing the first of a batch of simulations, episode after episode.
 
     Args:
-        policy: From what the environment shows to ``action``, on the CPU.
+        policy: From the environment's observations to ``action``, on the CPU.
         env: Environments.
         deterministic: Play the deterministic action rather than a sample.
-        num_options: Number of options among which the policy chooses, 0 if it does not.
-        aside: How far beside the character to draw a ghost, in units of the character's extent.
-        before_step: What to do before each step, such as taking up what training has learnt since.
+        num_options: Number of options of the policy, 0 without options.
+        aside: Distance of a ghost from the character, in extents of the character.
+        before_step: Called before each step, for example to load a newer checkpoint.
 
     Attributes:
         env: The environments without transforms.
-        extent: How far the character extends from its centre of mass, in metres.
+        extent: Largest distance of the character from its centre of mass, in metres.
         began: Whether an episode has just begun.
-        state: What the environment shows.
+        state: Current observations of the environment.
         pinned: Weights of primitives, by number from 0, that replace those of the gate.
     """
 
@@ -84,11 +84,11 @@ class Player:
 
     @property
     def has_gates(self) -> bool:
-        """Whether the policy ends by composing primitives under gates, which can be pinned."""
+        """Whether the policy ends with a composition of primitives by gates, which can be pinned."""
         return isinstance(self._policy, TensorDictSequential) and "gates" in self._policy[-1].in_keys
 
     def _compose_anew(self) -> None:
-        """Compose the primitives again, under the gates that are pinned."""
+        """Compose the primitives again, with pinned gates."""
         for primitive, weight in self.pinned.items():
             self._decision["gates"][..., primitive] = weight
         self._decision = self._policy[-1](self._decision)
@@ -110,10 +110,10 @@ class Player:
 
     @property
     def data(self) -> mujoco.MjData:
-        """The simulation now; the next step may write over it."""
+        """Current state of the simulation; the next step may overwrite it."""
         return self.env.simulation.data(0)
 
     @property
     def shapes(self) -> list[Shape]:
-        """What to draw beside the simulation now."""
+        """Shapes to draw in addition to the simulation."""
         return scenery(self.env, aside=self._aside)

@@ -1,4 +1,4 @@
-"""Films, weights of primitives and learning curves of a run in training, in its folder and its logger."""
+"""Films, weights of primitives and learning curves during training, in the run's folder and logger."""
 
 import copy
 import math
@@ -25,25 +25,25 @@ from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player, Weights
 
 FOLDER = "recordings"
-"""Of a run folder."""
+"""Subfolder of a run folder."""
 
 
 class Recorder:
-    """A film, the weights of the primitives in it, and the learning curve, every so many iterations.
+    """Saves a film, the weights of primitives in it, and the learning curve, every ``interval`` iterations.
 
-    It is told of every iteration as a logger is. It draws no random number of the run's, so that a run is the same
-    with it and without.
+    It is called in every iteration like a logger. It uses none of the run's random numbers, so that a run is the same
+    with and without it.
 
     Args:
         folder: The run folder; pictures go into its ``recordings/``.
         policy: The policy in training.
         make_env: Makes an environment to play in.
-        loggers: TorchRL loggers that show the pictures as well, as far as they can: TensorBoard, W&B and MLflow.
-        num_options: Number of options among which the policy chooses, 0 if it does not.
+        loggers: TorchRL loggers; TensorBoard, W&B and MLflow show the pictures as well.
+        num_options: Number of options of the policy, 0 without options.
         interval: Iterations between recordings.
-        seconds: Length of the film.
-        width: Of the film, in pixels.
-        height: Of the film, in pixels.
+        seconds: Length of the film in seconds.
+        width: Width of the film in pixels.
+        height: Height of the film in pixels.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Recorder:
         self._width, self._height = width, height
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
-        """Record, if it is time.
+        """Record, if a recording is due.
 
         Args:
             metrics: Metrics of an iteration, with its number as ``iteration``.
@@ -98,7 +98,7 @@ class Recorder:
                 num_options=self._num_options,
             )
             yield "film", film
-        except RuntimeError as error:  # no OpenGL, without which there are weights and curves none the less
+        except RuntimeError as error:  # no OpenGL; weights and curves do not need it
             warnings.warn(f"no film: {error}", stacklevel=2)
         if figure := self._weights(policy):
             figure.savefig(gates, dpi=100)
@@ -122,8 +122,8 @@ def draw_weights(values: torch.Tensor, timestep: float) -> Figure:
     """Draw weights over time, a line for each primitive.
 
     Args:
-        values: Shape ``(T, K)``.
-        timestep: Seconds between them.
+        values: Weights, shape ``(T, K)``.
+        timestep: Seconds between rows.
     """
     figure = new_figure(6.0, 3.0)
     axes = figure.add_subplot()
@@ -139,7 +139,7 @@ def draw_weights(values: torch.Tensor, timestep: float) -> Figure:
 def show(logger: Logger, name: str, path: Path, step: int) -> None:
     """Show a picture or an animated GIF in a logger.
 
-    TorchRL's own ``log_video`` encodes tensors as films with libraries that this one does not need.
+    TorchRL's ``log_video`` would need further libraries to encode tensors as films.
     """
     if isinstance(logger, TensorboardLogger):
         from tensorboard.compat.proto.summary_pb2 import Summary
@@ -163,6 +163,6 @@ def show(logger: Logger, name: str, path: Path, step: int) -> None:
 
 @contextmanager
 def _own_random_numbers() -> Iterator[None]:
-    """Leave torch's random numbers as they were."""
+    """Restore torch's random state after the block."""
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         yield

@@ -1,4 +1,4 @@
-"""A policy in play taken in hand: its goal, the gates of its primitives, and pushes."""
+"""Interactive control of a playing policy: its goal, the gates of its primitives, and pushes."""
 
 import math
 from collections.abc import Sequence
@@ -11,21 +11,20 @@ from torchrl_mcp.envs.transport import Transport
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
-"""By which a key turns the target direction."""
+"""Angle by which a key turns the target direction, in radians."""
 
 
 class Steering:
-    """What people do to a policy in play, which viewers report by whatever they have for it: keys, sliders, the mouse.
+    """A user's control of a playing policy, which viewers call on input from keys, sliders and the mouse.
 
-    What is in hand stays so over episodes, until :meth:`let_go`. A goal or a push that is set counts from the next step
-    on.
+    Settings persist over episodes, until :meth:`let_go`. A goal or a push takes effect in the next step.
 
     Args:
-        player: Whom to steer.
+        player: The player to steer.
 
     Attributes:
-        direction: Target direction of heading in hand, in radians from the world's x axis, or None: the task's own.
-        place: Where the target of an object is in hand, x and y in metres, or None: where the task has it.
+        direction: The user's target direction of heading, in radians from the world's x axis, or None for the task's.
+        place: The user's target position of an object, x and y in metres, or None for the task's.
     """
 
     def __init__(self, player: Player) -> None:
@@ -46,7 +45,7 @@ class Steering:
 
     @property
     def target_direction(self) -> float:
-        """Target direction of heading, in hand or not, in radians from -pi to pi."""
+        """Current target direction of heading, the user's or the task's, in radians from -pi to pi."""
         return _wrapped(float(self.player.env.episode["direction"][0]) if self.direction is None else self.direction)
 
     def aim(self, direction: float) -> None:
@@ -69,16 +68,16 @@ class Steering:
         self.player.pinned = self.player.pinned | {primitive: min(max(weight, 0.0), 1.0)}
 
     def release(self, primitive: int) -> None:
-        """Give the weight of a primitive back to the gate."""
+        """Return control of a primitive's weight to the gate."""
         self.player.pinned = {other: weight for other, weight in self.player.pinned.items() if other != primitive}
 
     def play_alone(self, primitive: int) -> None:
-        """Pin the gates so that one primitive acts alone: its weight at 1, those of the others at 0."""
+        """Pin the gates so that one primitive acts alone: its weight is 1, the others are 0."""
         if (weights := self.player.weights) is not None and self.player.has_gates:
             self.player.pinned = {other: float(other == primitive) for other in range(len(weights.values))}
 
     def play_next_alone(self, step: int) -> None:
-        """Let the next primitive act alone, or the one before if ``step`` is -1; beyond the last the gate acts."""
+        """Let the next primitive act alone, or the previous one if ``step`` is -1; after the last, release the gate."""
         if (weights := self.player.weights) is None:
             return
         alone = [number for number, weight in self.player.pinned.items() if weight == 1.0]
@@ -88,10 +87,10 @@ class Steering:
             self.play_alone(place)
 
     def push(self, forces: np.ndarray) -> None:
-        """Push bodies until told otherwise.
+        """Push bodies with constant forces, until the next call.
 
         Args:
-            forces: Forces and torques on each body in N and N m, as MuJoCo's ``xfrc_applied``, shape ``(nbody, 6)``.
+            forces: Forces and torques on each body in N and N m, MuJoCo's ``xfrc_applied``, shape ``(nbody, 6)``.
         """
         self.player.env.simulation.state["xfrc_applied"][0] = torch.from_numpy(forces)
 
@@ -100,14 +99,14 @@ class Steering:
         self.player.reset()
 
     def let_go(self) -> None:
-        """Give goal and gates back to task and policy."""
+        """Return control of goal and gates to task and policy."""
         self.direction = self.place = None
         self.player.pinned = {}
         if isinstance(self.player.env, Heading):
             self.player.env.max_turn = self._max_turn
 
     def step(self) -> None:
-        """Let the policy act once, under what is in hand."""
+        """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
         if self.direction is not None:
             env.episode["direction"][0] = self.direction

@@ -1,4 +1,4 @@
-"""A run in training, watched: its policy is always that of the newest checkpoint."""
+"""Watching a run during training: the policy is loaded from each new checkpoint."""
 
 import copy
 import time
@@ -12,15 +12,15 @@ from torchrl_mcp.training import checkpoint, run_folder
 class Watch:
     """Networks that follow the checkpoints of a run.
 
-    A newest checkpoint that is damaged or only half there is passed over.
+    Damaged or incomplete checkpoints are skipped.
 
     Args:
         run: The run folder.
-        parts: Of the agent, which are changed in place, on the CPU.
-        interval: Seconds between two looks at the folder.
+        parts: Parts of the agent, changed in place, on the CPU.
+        interval: Seconds between checks of the folder.
 
     Attributes:
-        frames: Environment steps after which the checkpoint in use was written, -1 before the first.
+        frames: Environment steps of the loaded checkpoint, -1 before the first.
     """
 
     def __init__(self, run: Path, parts: nn.ModuleDict, *, interval: float = 1.0) -> None:
@@ -30,7 +30,7 @@ class Watch:
         self._seen: set[tuple[str, int, int]] = set()
 
     def __call__(self) -> bool:
-        """Look, if it is time, and take up the newest checkpoint that is intact; return whether there was one."""
+        """Load the newest intact checkpoint if a check is due; return whether one was loaded."""
         if time.monotonic() < self._next_look:
             return False
         self._next_look = time.monotonic() + self._interval
@@ -45,10 +45,10 @@ class Watch:
             self._seen.add(seen)
             if not checkpoint.is_intact(path):
                 return False
-            # What does not fit is noticed in the middle, when some parts are loaded.
+            # Loading fails halfway if a part does not fit, so load into a copy.
             loaded = copy.deepcopy(self._parts)
             checkpoint.load_agent(loaded, path)
-        except (FileNotFoundError, ValueError):  # training has removed it meanwhile, or it is of another run
+        except (FileNotFoundError, ValueError):  # removed by training meanwhile, or from another run
             return False
         self._parts.load_state_dict(loaded.state_dict())
         self.frames = run_folder.frames(path)

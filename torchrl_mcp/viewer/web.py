@@ -1,4 +1,4 @@
-"""MuJoCo Studio's web viewer with ghosts, arrows and a panel to steer by."""
+"""MuJoCo Studio's web viewer with ghosts, arrows and a panel for steering."""
 
 import time
 from dataclasses import dataclass
@@ -12,55 +12,55 @@ from torchrl_mcp.envs.scenery import softly_lit
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.guard import HERE, guarded
 from torchrl_mcp.viewer.mouse import Mouse
-from torchrl_mcp.viewer.panel import Act, draw
+from torchrl_mcp.viewer.panel import Command, draw
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import TURN, Steering
 
 FURTHER = 1.4
-"""Times as far as in a film is the camera: a notice of Studio covers the upper part of the page."""
+"""Factor on the camera's distance in films: a notice of Studio covers the upper part of the page."""
 
 HORIZON, ZENITH = (0.45, 0.78, 1.0, 1.0), (0.25, 0.55, 1.0, 1.0)
-"""Of the sky, which Studio draws at a quarter of its brightness: the haze of films would be as grey as a wall."""
+"""Colours of the sky, which Studio draws at a quarter of their brightness: the haze of films would look grey."""
 
-KEYS: dict[imgui.Key, Act] = {
+KEYS: dict[imgui.Key, Command] = {
     imgui.Key.LeftArrow: lambda steering: steering.turn(TURN),
     imgui.Key.RightArrow: lambda steering: steering.turn(-TURN),
     imgui.Key.UpArrow: lambda steering: steering.play_next_alone(-1),
     imgui.Key.DownArrow: lambda steering: steering.play_next_alone(1),
 }
-"""What the arrow keys do."""
+"""Commands of the arrow keys."""
 
 
 @dataclass(frozen=True)
-class Deed(messages.Event):
-    """What somebody does in the browser, for the thread of the simulation.
+class BrowserEvent(messages.Event):
+    """A user's command from the browser to the simulation's thread.
 
     Args:
-        act: What to do.
+        command: The command.
     """
 
-    act: Act
+    command: Command
 
 
-class Stage(viewer_app.ViewerApp):
-    """MuJoCo Studio's own interface, whose camera follows the character.
+class StudioApp(viewer_app.ViewerApp):
+    """MuJoCo Studio's interface with the panel, and a camera that follows the character.
 
     Attributes:
-        shapes: What to draw beside the simulation.
-        weights: Of the primitives, or None to show no bars.
+        shapes: Shapes to draw in addition to the simulation.
+        weights: Weights of the primitives, or None for no bars.
 
-    The viewer's thread reads these and what is in hand, so that others replace them but do not change them.
+    The viewer's thread reads these and the steering, so other threads must replace them and not change them in place.
 
     Args:
-        steering: What is in hand.
-        distance: Of the camera from the character, in metres.
+        steering: Current steering, read-only.
+        distance: Distance of the camera from the character, in metres.
     """
 
     def __init__(self, steering: Steering, *, distance: float) -> None:
         self.shapes: list[Shape] = []
         self.weights: Weights | None = None
         self._steering, self._distance = steering, distance
-        self._mouse = Mouse(lambda place: self._do(lambda steering: steering.put(place)))
+        self._mouse = Mouse(lambda place: self._send(lambda steering: steering.put(place)))
         super().__init__(viewer_app.ViewerAppConfig(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
@@ -72,15 +72,15 @@ class Stage(viewer_app.ViewerApp):
         self.ux_state.camera_index = ux.set_camera(self.model, camera, following)
 
     def handle_keyboard_events(self) -> None:
-        """Steer with the arrow keys; the others are Studio's."""
+        """Steer with the arrow keys; Studio handles the other keys."""
         if not imgui.GetIO().WantCaptureKeyboard:
-            for key, act in KEYS.items():
-                if imgui.IsKeyPressed(key, False):  # once, however long it is held
-                    self._do(act)
+            for key, command in KEYS.items():
+                if imgui.IsKeyPressed(key, False):  # without repeats
+                    self._send(command)
         super().handle_keyboard_events()
 
     def handle_mouse_events(self) -> None:
-        """Drag bodies and put the target; the rest is Studio's."""
+        """Drag bodies and place the target; Studio handles the rest."""
         if not self._mouse.handle(self.viewer):
             super().handle_mouse_events()
 
@@ -92,18 +92,18 @@ class Stage(viewer_app.ViewerApp):
     @messages.handler
     def on_build_gui(self, _: messages.BuildGuiEvent) -> None:
         """Show the panel."""
-        draw(self._steering, self.weights, self._do)
+        draw(self._steering, self.weights, self._send)
 
-    def _do(self, act: Act) -> None:
-        self.viewer.send_to_sim(Deed(act))
+    def _send(self, command: Command) -> None:
+        self.viewer.send_to_sim(BrowserEvent(command))
 
 
 class Pace(plugin.SimPlugin):
-    """The pace that the viewer's controls set.
+    """Pause and speed as set by the viewer's controls.
 
     Attributes:
-        paused: Whether to wait.
-        speed: Relative to real time.
+        paused: Whether the simulation is paused.
+        speed: Speed relative to real time.
     """
 
     paused = False
@@ -111,24 +111,24 @@ class Pace(plugin.SimPlugin):
 
     @messages.handler
     def on_step_control(self, snapshot: messages.StepControlSnapshot) -> None:
-        """Take over what the viewer shows."""
+        """Copy the viewer's settings."""
         self.paused, self.speed = snapshot.pause_state != sim.PauseState.UNPAUSED, snapshot.speed / 100
 
 
-class Hands(plugin.SimPlugin):
-    """What is done in the browser, done.
+class BrowserInput(plugin.SimPlugin):
+    """Executes the browser's commands in the simulation's thread.
 
     Args:
-        steering: Whom to steer.
+        steering: The steering to change.
     """
 
     def __init__(self, steering: Steering) -> None:
         self._steering = steering
 
     @messages.handler
-    def on_deed(self, deed: Deed) -> None:
-        """Do it."""
-        deed.act(self._steering)
+    def on_browser_event(self, event: BrowserEvent) -> None:
+        """Execute a command."""
+        event.command(self._steering)
 
     @messages.handler
     def on_reset(self, _: messages.ResetEvent) -> None:
@@ -137,32 +137,32 @@ class Hands(plugin.SimPlugin):
 
 
 def as_geom(shape: Shape) -> mujoco.MjvGeom:
-    """Return a shape as Studio draws it."""
+    """Convert a shape to Studio's type."""
     geom = mujoco.MjvGeom()
     mujoco.mjv_initGeom(geom, *shape)
     return geom
 
 
 def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
-    """Play until the viewer is closed, in real time or as its controls say.
+    """Play until the viewer is closed, at the speed of its controls.
 
     Args:
-        player: What to show.
-        port: Of the page, 0 for the first free one from 8080.
-        host: Address of the interface to listen on; others than this machine can watch, but not control.
+        player: The player to show.
+        port: Port of the page, 0 for the first free one from 8080.
+        host: Address of the interface to listen on; other machines can watch, but not control.
     """
     steering, pace = Steering(player), Pace()
-    stage = Stage(steering, distance=FURTHER * DISTANCE * player.extent)
+    app = StudioApp(steering, distance=FURTHER * DISTANCE * player.extent)
     model = softly_lit(player.env.simulation.model, horizon=HORIZON, zenith=ZENITH)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
-    with guarded(host), launch_web.launch(config, plugins=[stage, pace, Hands(steering)]) as viewer:
+    with guarded(host), launch_web.launch(config, plugins=[app, pace, BrowserInput(steering)]) as viewer:
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / pace.speed
             if not pace.paused:
                 steering.step()
             mujoco.mj_copyData(data, model, player.data)
-            stage.shapes, stage.weights = player.shapes, player.weights or stage.weights
+            app.shapes, app.weights = player.shapes, player.weights or app.weights
             viewer.sync(model, data)
-            steering.push(data.xfrc_applied)  # where a body is dragged
+            steering.push(data.xfrc_applied)  # of a dragged body
             time.sleep(max(0.0, due - time.perf_counter()))

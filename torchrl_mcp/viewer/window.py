@@ -1,4 +1,4 @@
-"""MuJoCo's own window, with ghosts, arrows and the weights of primitives, and keys to steer by."""
+"""MuJoCo's own window, with ghosts, arrows, the weights of primitives, and keys for steering."""
 
 import os
 import sys
@@ -17,27 +17,27 @@ from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import TURN, Steering
 
 LENGTH = 24
-"""Strokes of a weight of 1."""
+"""Number of strokes for a weight of 1."""
 
 SLOWER = 0.5
-"""Factor of a key on the pace."""
+"""Factor on the speed for each press of the slower key."""
 
 
 class Keyboard:
-    """Keys of the window, which a thread of its own reports.
+    """Keys of the window, which the window's thread reports.
 
     Attributes:
-        paused: Whether to wait.
-        speed: Relative to real time.
+        paused: Whether the simulation is paused.
+        speed: Speed relative to real time.
 
     Args:
-        steering: Whom to steer.
+        steering: The steering to change.
     """
 
     def __init__(self, steering: Steering) -> None:
         self.paused, self.speed = False, 1.0
         self._pressed: SimpleQueue[int] = SimpleQueue()
-        self._deeds: dict[int, Callable[[], None]] = {
+        self._commands: dict[int, Callable[[], None]] = {
             263: lambda: steering.turn(TURN),  # GLFW's left arrow
             262: lambda: steering.turn(-TURN),  # right
             265: lambda: steering.play_next_alone(-1),  # up
@@ -50,18 +50,18 @@ class Keyboard:
         }
 
     def press(self, key: int) -> None:
-        """Note that a key was pressed, by GLFW's number."""
+        """Store a pressed key, by GLFW's number."""
         self._pressed.put(key)
 
-    def obey(self) -> None:
-        """Do what the keys say that were pressed since."""
+    def execute(self) -> None:
+        """Execute the commands of the keys pressed since the last call."""
         while True:
             try:
-                deed = self._deeds.get(self._pressed.get_nowait())
+                command = self._commands.get(self._pressed.get_nowait())
             except Empty:
                 return
-            if deed is not None:
-                deed()
+            if command is not None:
+                command()
 
     def _pause(self) -> None:
         self.paused = not self.paused
@@ -71,10 +71,10 @@ class Keyboard:
 
 
 def play_in_window(player: Player) -> None:
-    """Play in real time, or as the keys say, until the window is closed.
+    """Play until the window is closed, at the speed that the keys set.
 
     Args:
-        player: What to show.
+        player: The player to show.
 
     Raises:
         RuntimeError: If there is no display.
@@ -91,39 +91,39 @@ def play_in_window(player: Player) -> None:
         camera.distance, camera.azimuth, camera.elevation = DISTANCE * player.extent, AZIMUTH, ELEVATION
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / keyboard.speed
-            keyboard.obey()
+            keyboard.execute()
             if not keyboard.paused:
                 steering.step()
             with viewer.lock():
                 mujoco.mj_copyData(data, model, player.data)
                 viewer.user_scn.ngeom = 0
                 add_shapes(viewer.user_scn, player.shapes)
-                grasp(steering, model, data, viewer.perturb)
+                apply_mouse(steering, model, data, viewer.perturb)
             if player.weights is not None:
                 viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *as_text(player.weights)))
             viewer.sync()
             time.sleep(max(0.0, due - time.perf_counter()))
 
 
-def grasp(steering: Steering, model: mujoco.MjModel, data: mujoco.MjData, hand: mujoco.MjvPerturb) -> None:
-    """Push the body that the mouse drags, and put the target where the ground was chosen.
+def apply_mouse(steering: Steering, model: mujoco.MjModel, data: mujoco.MjData, mouse: mujoco.MjvPerturb) -> None:
+    """Push the body that the mouse drags, and place the target at the point selected on the ground.
 
     Args:
-        steering: Whom to steer.
+        steering: The steering to change.
         model: The scene.
-        data: Its state.
-        hand: What the mouse has chosen and where it drags it.
+        data: State of the scene.
+        mouse: Selection and drag of the mouse.
     """
-    if hand.select == 0 and hand.localpos.any():
-        steering.put(hand.localpos)
-        hand.localpos[:] = 0  # once
+    if mouse.select == 0 and mouse.localpos.any():
+        steering.put(mouse.localpos)
+        mouse.localpos[:] = 0  # only once
     data.xfrc_applied[:] = 0
-    mujoco.mjv_applyPerturbForce(model, data, hand)
+    mujoco.mjv_applyPerturbForce(model, data, mouse)
     steering.push(np.array(data.xfrc_applied))
 
 
 def require_display() -> None:
-    """Refuse to open a window where none can be: MuJoCo would wait for it for ever.
+    """Check that there is a display: MuJoCo would wait for a window forever.
 
     Raises:
         RuntimeError: If there is no display.
@@ -136,7 +136,7 @@ def require_display() -> None:
 
 
 def as_text(weights: Weights) -> tuple[str, str]:
-    """Return two columns of text: the numbers of the primitives below the title, and their weights as strokes."""
+    """Return two columns of text: title and numbers of the primitives, and their weights as strokes."""
     numbers = [str(number + 1) for number in range(len(weights.values))]
     strokes = ["|" * round(LENGTH * value) for value in weights.values]
     return "\n".join([weights.title, *numbers]), "\n".join(["", *strokes])

@@ -1,1 +1,1 @@
-"""Recorded motion: file formats, skeletons, and how a character takes them over."""
+"""Recorded motion: file formats, skeletons, and retargeting to characters."""

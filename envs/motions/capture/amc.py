@@ -1,4 +1,4 @@
-"""Acclaim's motion files (``.amc``), which say what the bones of a skeleton file (``.asf``) do."""
+"""Acclaim's motion files (``.amc``), which move the bones of a skeleton file (``.asf``)."""
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,26 +13,26 @@ from torchrl_mcp.envs.motions.capture.textfile import TextFile, shortened
 from torchrl_mcp.envs.rotations import from_rotation_vector, inverse, multiply
 
 CMU_FPS = 120.0
-"""The files hold no frame rate. This is that of most of CMU's recordings; a few have 60."""
+"""Frame rate of most of CMU's recordings, as the files have none; a few recordings have 60."""
 
 
 def read_asf_amc(path: str | Path, *, asf: str | Path | None = None, fps: float | None = None) -> SourceMotion:
-    r"""Read a motion and the skeleton that it belongs to.
+    r"""Read a motion and its skeleton.
 
-    The channels of a bone turn it, one after the other, about axes fixed where it begins:
+    The channels of a bone turn it, one after the other, about fixed axes at its beginning:
 
     .. math:: R = C R_z R_y R_x C^{-1}
 
-    A bone that a frame does not mention is not turned. Joints bear the names of the bones that begin there; the ends of
-    bones on which none hang are joints too.
+    A bone that a frame does not mention is not turned. Joints have the names of the bones that begin there; the ends of
+    bones without children are joints as well.
 
     Args:
         path: The ``.amc`` file.
         asf: The ``.asf`` file, or None for the one beside it: ``02.asf`` for ``02_01.amc``, or else the only one.
-        fps: Frames per second, which the files do not hold; None is 120.
+        fps: Frames per second, which are not in the files; None is 120.
 
     Raises:
-        MotionFormatError: If a file is not of this kind, or damaged, or the two do not belong together.
+        MotionFormatError: If a file has another format or is damaged, or the two files do not match.
 
     Reference:
         M. Meredith and S. Maddock, Motion Capture File Formats Explained, 2001
@@ -97,7 +97,7 @@ def _motion(file: TextFile, skeleton: AsfSkeleton, joints: int) -> tuple[Tensor,
 
 
 def _frames(file: TextFile, skeleton: AsfSkeleton) -> Iterator[tuple[int, Mapping[str, Sequence[float]]]]:
-    """Read one frame after the other: its line, and the channels of the bones that it mentions."""
+    """Read frame by frame: its line, and the channels of the bones that it mentions."""
     start, expected = 0, 0.0
     frame: dict[str, Sequence[float]] = {}
     for line, (name, *words) in file.statements(comment="#"):
@@ -125,7 +125,7 @@ def _frames(file: TextFile, skeleton: AsfSkeleton) -> Iterator[tuple[int, Mappin
 
 
 def _in_degrees(file: TextFile, skeleton: AsfSkeleton) -> bool:
-    """Whether angles are in degrees; where the motion does not say, the skeleton does."""
+    """Whether angles are in degrees, according to the motion or else the skeleton."""
     units = {":degrees": True, ":radians": False}
     keywords = (statement.words[0].lower() for statement in file.statements(comment="#"))
     return next((units[keyword] for keyword in keywords if keyword in units), skeleton.degrees)

@@ -1,4 +1,4 @@
-"""Which joint of a skeleton is the knee? Names of joints differ from one maker to the next."""
+"""Recognising the joints of a skeleton, whose names differ between makers."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +13,8 @@ LEG = ("hip", "knee", "ankle")
 ARM = ("shoulder", "elbow", "wrist")
 """Joints of a limb, from the trunk outwards."""
 
-# What BVH exporters, CMU, SMPL, game engines and animation programs call them, the less ambiguous names first:
-# LeftShoulder is a collar bone where there is a LeftArm, and LeftHip the side of a pelvis where there is a LeftUpLeg.
+# Names in BVH exporters, CMU, SMPL, game engines and animation programs, the less ambiguous names first:
+# LeftShoulder is a collar bone if there is a LeftArm, and LeftHip the side of a pelvis if there is a LeftUpLeg.
 NAMES = {
     "hip": ("upleg", "upperleg", "thigh", "femur", "hip"),
     "knee": ("knee", "lowleg", "lowerleg", "shin", "calf", "tibia", "leg"),
@@ -27,13 +27,13 @@ HEADS = ("head", "torsohead", "upperneck", "neck1", "neck")
 
 
 def limb(side: str, joints: tuple[str, str, str]) -> tuple[str, str, str]:
-    """Name the parts of one limb, from the trunk outwards."""
+    """Return the names of the parts of one limb, from the trunk outwards."""
     first, middle, last = joints
     return f"{side}_{first}", f"{side}_{middle}", f"{side}_{last}"
 
 
 def bones(joints: tuple[str, str, str]) -> Iterator[tuple[str, str]]:
-    """Name both ends of all bones of the legs or of the arms."""
+    """Yield the names of both ends of all bones of the legs or of the arms."""
     for side in SIDES:
         first, middle, last = limb(side, joints)
         yield first, middle
@@ -43,7 +43,7 @@ def bones(joints: tuple[str, str, str]) -> Iterator[tuple[str, str]]:
 TRUNK = ("root", "chest")
 LEGS = tuple(part for side in SIDES for part in limb(side, LEG))
 HEAD_AND_ARMS = ("neck", *(part for side in SIDES for part in limb(side, ARM)))
-"""Parts of a body by the names of the humanoid's bodies; each begins at the joint on which it hangs."""
+"""Parts of a body by the names of the humanoid's bodies; each begins at its joint to the parent."""
 
 
 def find_joints(
@@ -51,20 +51,20 @@ def find_joints(
 ) -> dict[str, int]:
     """Find the joints at which parts of the body begin.
 
-    The root is where the legs come together, the chest where the arms do; the others are found by name.
+    The root is the common ancestor of the legs, the chest of the arms; the others are found by name.
 
     Args:
         source: The motion with its skeleton.
         parts: Names of bodies of the humanoid: ``root``, ``chest``, ``neck`` (the head), ``left_hip``, ...
-        joint_map: Names of joints by part, for those that are not found, or wrongly.
+        joint_map: Names of joints by part, for parts that are not found, or found wrongly.
 
     Returns:
         Index of a joint for each part.
 
     Raises:
-        MotionFormatError: If the skeleton has not a joint that the map names, one is not found, or a limb or the head
-            is found on the root.
-        ValueError: If the map is about what is no part of the body.
+        MotionFormatError: If the skeleton lacks a joint of the map, a joint is not found, or a limb or the head is
+            found on the root.
+        ValueError: If the map has an unknown part.
     """
     given, known = joint_map or {}, (*TRUNK, *LEGS, *HEAD_AND_ARMS)
     if wrong := sorted(given.keys() - set(known)):
@@ -99,19 +99,19 @@ def find_joints(
 
 
 def _suggestion(part: str, names: Sequence[str]) -> str:
-    """A joint that may be the part, so that nobody follows an example that is wrong; JOINT where names tell nothing."""
+    """Return a joint that may be the part, as an example for the user; JOINT if no name fits."""
     heads = [name for name in names if part == "neck" and re.search("head|neck", name.lower())]
     return heads[-1] if heads else "JOINT"
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Names in small letters, without what all of them begin with: ``mixamorig:LeftUpLeg`` is ``leftupleg``."""
+    """Names in lower case without their common prefix: ``mixamorig:LeftUpLeg`` becomes ``leftupleg``."""
     shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(min(names), max(names), strict=False)))
     return [re.sub(r"[^a-z0-9]", "", name[shared:].rpartition(":")[2].lower()) for name in names]
 
 
 def _spellings(part: str) -> Iterator[str]:
-    """How a part may be spelled, the better guesses first."""
+    """Yield possible spellings of a part, the likeliest first."""
     if part == "neck":
         yield from HEADS
         return

@@ -23,9 +23,9 @@ class Bone:
     """A bone, or the root, which has no length.
 
     Attributes:
-        tip: Its end relative to its beginning, shape ``(3,)``.
-        axes: Rotation C of the axes about which it turns, shape ``(4,)``.
-        dof: Names of its channels.
+        tip: End of the bone relative to its beginning, shape ``(3,)``.
+        axes: Rotation C of the axes about which the bone turns, shape ``(4,)``.
+        dof: Names of the channels.
     """
 
     tip: Tensor
@@ -39,9 +39,9 @@ class AsfSkeleton:
 
     Attributes:
         path: The file.
-        bones: By name; each comes after its parent, the root first.
-        parents: Name of the parent of each bone but the root.
-        position: Of the root, shape ``(3,)``, where a motion does not say otherwise.
+        bones: Bones by name; each comes after its parent, the root first.
+        parents: Name of the parent of each bone except the root.
+        position: Default position of the root, shape ``(3,)``.
         unit: Metres per unit of length.
         degrees: Whether angles are in degrees, not radians.
     """
@@ -61,7 +61,7 @@ def read_asf(path: str | Path) -> AsfSkeleton:
         path: The file.
 
     Raises:
-        MotionFormatError: If the file is not ASF, or damaged.
+        MotionFormatError: If the file is not ASF, or is damaged.
     """
     file = TextFile.read(path)
     sections: dict[str, list[Statement]] = {}
@@ -103,7 +103,7 @@ def _units(file: TextFile, section: Sequence[Statement]) -> tuple[float, bool]:
 
 
 def _root(file: TextFile, section: Sequence[Statement], degrees: bool) -> tuple[Tensor, Bone]:
-    """Read where the root is, and its axes and channels."""
+    """Read the position, axes and channels of the root."""
     position, angles, order = [0.0] * 3, [0.0] * 3, "xyz"
     dof: list[str] = []
     for statement in section:
@@ -141,7 +141,7 @@ def _bones(file: TextFile, section: Sequence[Statement], degrees: bool) -> dict[
 
 
 def _bone(file: TextFile, block: Mapping[str, Statement], line: int, degrees: bool) -> tuple[str, Bone]:
-    """Read one bone and its name; limits, masses and the like are of no use here."""
+    """Read one bone and its name; limits, masses and other entries are ignored."""
     if missing := {"name", "direction", "length"} - block.keys():
         raise file.error(f"a bone has no {', '.join(sorted(missing))}: add it", line)
     if len(block["name"].words) != 2:
@@ -187,7 +187,7 @@ def _axes(angles: Sequence[float], order: str, degrees: bool) -> Tensor:
 
 
 def _hierarchy(file: TextFile, section: Sequence[Statement], bones: Mapping[str, Bone]) -> dict[str, str]:
-    """Read which bones hang on which, each after its parent."""
+    """Read the parent of each bone, each after its parent."""
     parents: dict[str, str] = {}
     for line, words in section:
         if [word.lower() for word in words] in (["begin"], ["end"]):

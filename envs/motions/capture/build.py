@@ -1,4 +1,4 @@
-"""A clip from the motion of a human body's joints, whoever recorded it."""
+"""Building a clip from the motion of a human body's joints."""
 
 from collections.abc import Mapping
 
@@ -18,10 +18,10 @@ HUMANS = ("humanoid", "biped")
 """Characters with the joints of a human body."""
 
 TOP_SPEED = 25.0
-"""m/s. No part of a body moves faster but in a jump of the recording from one pose to another."""
+"""Speed in m/s that parts of a body exceed only if the recording jumps from one pose to another."""
 
 LONGEST = 3600.0
-"""Seconds. What claims to last longer is damaged, or would fill the memory."""
+"""Longest duration in seconds; longer files are damaged, or would fill the memory."""
 
 HIGHEST_RATE = 1000.0
 
@@ -30,7 +30,7 @@ def require_human(character: str) -> None:
     """Check that a character has the joints of a human body.
 
     Raises:
-        ValueError: If it has not.
+        ValueError: If it lacks them.
     """
     if character not in HUMANS:
         raise ValueError(f"character={character!r} has not the joints of a human body: pass one of {', '.join(HUMANS)}")
@@ -41,20 +41,20 @@ def assembled(
 ) -> MotionClip:
     """Make a clip of the motion of a human body's joints.
 
-    It begins at x = y = 0, has the soles on the ground, and keeps within the limits of the character's joints. Joints
-    that the character lacks are left out; those that it alone has stay straight.
+    It begins at x = y = 0, with the soles on the ground, and respects the limits of the character's joints. Joints that
+    the character lacks are left out; joints that only the character has stay straight.
 
     Args:
         character: ``"humanoid"`` or ``"biped"``.
         path: Position of the root, shape ``(T, 3)``, in metres.
-        motion: By joint of the humanoid, quaternions relative to the parent, shape ``(T, 4)``, or angles, shape
-            ``(T,)``, in radians; the root's relative to the world.
-        times: Of the states, increasing from 0, shape ``(T,)``, in seconds.
-        rate: Frames per second of the clip, or the nearest to it that divides its duration into whole frames.
+        motion: Motion by joint of the humanoid: quaternions relative to the parent, shape ``(T, 4)``, or angles in
+            radians, shape ``(T,)``; the root's quaternions are relative to the world.
+        times: Times of the states in seconds, increasing from 0, shape ``(T,)``.
+        rate: Frames per second of the clip; the nearest rate that divides its duration into whole frames is used.
         loop: Whether the motion repeats.
 
     Raises:
-        ValueError: If less than two frames would remain at this rate.
+        ValueError: If fewer than two frames would remain at this rate.
     """
     duration = float(times[-1])
     steps = round(duration * rate) if 0 < rate <= HIGHEST_RATE else 0
@@ -68,7 +68,7 @@ def assembled(
 
 
 def states(character: str, path: Tensor, motion: Mapping[str, Tensor]) -> Tensor:
-    """Put joints in MuJoCo's order, within their limits, shape ``(T, nq)``; see :func:`assembled`."""
+    """States in MuJoCo's order, with joints within their limits, shape ``(T, nq)``; see :func:`assembled`."""
     model = character_model(character)
     qpos = torch.from_numpy(model.qpos0).repeat(len(path), 1)
     qpos[:, :3], qpos[:, 3:7] = path, motion["root"]
@@ -85,7 +85,7 @@ def states(character: str, path: Tensor, motion: Mapping[str, Tensor]) -> Tensor
 
 
 def grounded(character: str, qpos: Tensor) -> Tensor:
-    """Let a motion begin at x = y = 0, with no foot below the ground but in a fiftieth of the frames.
+    """Shift a motion to begin at x = y = 0, with feet below the ground in at most a fiftieth of the frames.
 
     Args:
         character: Name of the character.
@@ -107,7 +107,7 @@ def speeds(path: Tensor, times: Tensor) -> Tensor:
 
     Args:
         path: Positions, shape ``(T, 3)``.
-        times: Of the positions, shape ``(T,)``, in seconds.
+        times: Times of the positions, shape ``(T,)``, in seconds.
     """
     return torch.linalg.vector_norm(path.diff(dim=0), dim=-1) / times.diff()
 

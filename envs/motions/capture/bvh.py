@@ -17,7 +17,7 @@ from torchrl_mcp.envs.rotations import from_rotation_vector, multiply
 CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)
 
 FRAME_TIMES = (1e-4, 1.0)
-"""Seconds, from the fastest cameras to the slowest."""
+"""Range of seconds per frame, from the fastest cameras to the slowest."""
 
 
 @dataclass
@@ -34,18 +34,18 @@ class _Joint:
 def read_bvh(path: str | Path, *, fps: float | None = None) -> SourceMotion:
     r"""Read a BVH file.
 
-    The rotations of a joint are done in the order of its channels, each about an axis that those before have turned:
+    The rotations of a joint are applied in the order of its channels, each about an axis turned by the previous ones:
 
     .. math:: R = R_{c_1} R_{c_2} R_{c_3}
 
-    A position channel, of whatever joint, takes the place of that component of its offset. End sites become joints.
+    A position channel of any joint replaces that component of its offset. End sites become joints.
 
     Args:
         path: The file.
-        fps: Frames per second, or None for what the file says.
+        fps: Frames per second, or None for the file's own rate.
 
     Raises:
-        MotionFormatError: If the file is not BVH, or damaged.
+        MotionFormatError: If the file is not BVH, or is damaged.
 
     Reference:
         M. Meredith and S. Maddock, Motion Capture File Formats Explained, 2001
@@ -131,7 +131,7 @@ def _declared_channels(file: TextFile, statement: Statement) -> list[tuple[str, 
 def _motion(
     file: TextFile, statements: Iterator[Statement], joints: Sequence[_Joint]
 ) -> tuple[float, Tensor, Sequence[int]]:
-    """Read what follows ``MOTION``: seconds per frame, channels, shape ``(T, C)``, and the lines of the frames."""
+    """Read the part after ``MOTION``: seconds per frame, channels, shape ``(T, C)``, and the lines of the frames."""
     frames, (seconds, line) = _header(file, statements, "Frames"), _header(file, statements, "Frame Time")
     if not FRAME_TIMES[0] <= seconds <= FRAME_TIMES[1]:
         raise file.error(f"Frame Time is {seconds:g} s: correct it to {FRAME_TIMES[0]:g} to {FRAME_TIMES[1]:g} s", line)
@@ -161,7 +161,7 @@ def _header(file: TextFile, statements: Iterator[Statement], key: str) -> tuple[
 
 
 def _transforms(joints: Sequence[_Joint], values: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn channels into translations and rotations, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
+    """Convert channels to translations and rotations, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
     offsets = torch.tensor([joint.offset for joint in joints], dtype=torch.float64)
     translations, rotations = offsets.repeat(len(values), 1, 1), identities(len(values), len(joints))
     columns = iter(values.unbind(-1))

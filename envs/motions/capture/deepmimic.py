@@ -22,27 +22,27 @@ BIPED = {"root": 4, "chest": 4, **RIGHT_LEG, **LEFT_LEG}
 """Columns of each joint, after duration and root position: a quaternion or an angle. The biped's chest is its torso."""
 
 LAYOUTS = {4 + sum(joints.values()): joints for joints in (HUMANOID, BIPED)}
-"""By length of a frame."""
+"""Joints by length of a frame."""
 
 
 def read_deepmimic(path: str | Path, character: str, *, rate: float = 30.0, fps: float | None = None) -> MotionClip:
     """Read a motion of DeepMimic's humanoid (44 numbers a frame) or of DeepLoco's biped (30).
 
-    Their axes, x forward, y up, z right, become x forward, y left, z up. The clip begins at x = y = 0 and is set on the
-    ground. The joints keep their rotations, within the limits of the character; joints that the file has not stay
-    straight, and those that the character has not are left out.
+    Their axes, x forward, y up, z right, become x forward, y left, z up. The clip begins at x = y = 0, on the ground.
+    The joints keep their rotations, within the limits of the character; joints that the file lacks stay straight, and
+    joints that the character lacks are left out.
 
-    A motion that wraps goes on where it ends but turned as at its beginning. Its last frame repeats the first, if
-    inexactly: what is missing is spread evenly over the cycle.
+    A motion that wraps continues from the position of its end with the orientation of its beginning. Its last frame
+    approximately repeats the first; the difference is spread evenly over the cycle.
 
     Args:
         path: The file.
-        character: ``"humanoid"`` or ``"biped"``; either reads the files of both.
-        rate: Frames per second of the clip, or the nearest that divides it into whole frames.
-        fps: Frames per second of the file, or None for the durations that it holds.
+        character: ``"humanoid"`` or ``"biped"``; both can read the files of both.
+        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
+        fps: Frames per second of the file, or None for the file's own durations.
 
     Raises:
-        MotionFormatError: If the file is not of this kind, or damaged.
+        MotionFormatError: If the file has another format, or is damaged.
         ValueError: If an argument is out of range.
 
     Reference:
@@ -69,7 +69,7 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
         content = json.loads(file.text)
     except json.JSONDecodeError as error:
         raise file.error(f"is not JSON: {error.msg}", error.lineno) from error
-    except (RecursionError, ValueError) as error:  # nesting without end, or a number without end
+    except (RecursionError, ValueError) as error:  # nested too deeply, or a number with too many digits
         raise file.error(f"is not JSON of a motion: {error}", 1) from error
     if not isinstance(content, dict) or not isinstance(content.get("Frames"), list) or len(content["Frames"]) < 2:
         raise file.error('has no list of two or more "Frames": pass a motion of DeepMimic or DeepLoco', 1)
@@ -92,14 +92,14 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
 
 
 def _line(file: TextFile, frame: int) -> int:
-    """Line at which a frame begins, for an error: frames are lists of numbers, and hold no brackets of their own."""
+    """Line at which a frame begins, for an error: frames are lists of numbers, without inner brackets."""
     brackets = re.finditer(r"\[", file.text[file.text.find('"Frames"') :])
     bracket = next(islice(brackets, frame + 1, None), None)
     return file.text.count("\n", 0, file.text.find('"Frames"') + (bracket.start() if bracket else 0)) + 1
 
 
 def _times(file: TextFile, durations: Tensor) -> Tensor:
-    """Seconds from the first frame to each, shape ``(T,)``; the duration of the last is 0, or means nothing."""
+    """Seconds from the first frame to each, shape ``(T,)``; the duration of the last frame is ignored."""
     if not (durations[:-1] > 0).all():
         frame = int((durations[:-1] <= 0).nonzero()[0])
         raise file.error(f"frame {frame + 1} lasts {durations[frame]:g} s: correct its duration", _line(file, frame))
@@ -114,7 +114,7 @@ def _times(file: TextFile, durations: Tensor) -> Tensor:
 
 
 def _motion(file: TextFile, frames: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the path of the root, shape ``(T, 3)``, and joint by joint quaternions or angles, in our axes."""
+    """Return the path of the root, shape ``(T, 3)``, and quaternions or angles by joint, in this library's axes."""
     layout = LAYOUTS[frames.shape[1]]
     _, path, *columns = frames.split([1, 3, *layout.values()], dim=-1)
     motion = {}
@@ -140,12 +140,12 @@ def _require_no_jump(file: TextFile, root: Tensor, times: Tensor) -> None:
 
 
 def _closed(values: Tensor) -> Tensor:
-    """Let a cycle of numbers end as it began, shape ``(T,)``: what is missing comes evenly over time."""
+    """Close a cycle of numbers, shape ``(T,)``, by spreading the difference of its ends evenly over time."""
     return values + (values[0] - values[-1]) * torch.linspace(0, 1, len(values), dtype=torch.float64)
 
 
 def _closed_turns(turns: Tensor) -> Tensor:
-    """Let a cycle of rotations end as it began, shape ``(T, 4)``."""
+    """Close a cycle of rotations, shape ``(T, 4)``, in the same way."""
     missing = to_rotation_vector(multiply(inverse(turns[-1]), turns[0]))
     fraction = torch.linspace(0, 1, len(turns), dtype=torch.float64)
     return multiply(turns, from_rotation_vector(fraction.unsqueeze(-1) * missing))

@@ -1,4 +1,4 @@
-"""Recorded motion of any supported format as a clip of a character."""
+"""Importing recorded motion of any supported format as a clip of a character."""
 
 import math
 from collections.abc import Mapping
@@ -14,13 +14,13 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 
 class Import(NamedTuple):
-    """A recorded motion and how it was read.
+    """A recorded motion and the lean of its rest pose.
 
     Args:
         clip: The motion.
         rest_lean: Greatest angle in degrees between the vertical and trunk or legs in the pose that was taken for
-            standing upright: so much of a lean the clip may lack or have too much. NaN for DeepMimic's files, which
-            hold the character's own joints.
+            standing upright: a bound on the error of leans in the clip. NaN for DeepMimic's files, which have the
+            character's own joints.
     """
 
     clip: MotionClip
@@ -28,12 +28,12 @@ class Import(NamedTuple):
 
 
 def import_motion(path: str | Path, character: str, **options: Any) -> MotionClip:
-    """Read a motion file as a clip of the humanoid or the biped: :func:`imported` without how it was read.
+    """Read a motion file as a clip of the humanoid or the biped: the clip of :func:`imported`.
 
     Args:
         path: The file.
         character: ``"humanoid"`` or ``"biped"``.
-        **options: Those of :func:`imported`.
+        **options: Options of :func:`imported`.
     """
     return imported(path, character, **options).clip
 
@@ -50,25 +50,25 @@ def imported(
     rest_frame: int | None = None,
     asf: str | Path | None = None,
 ) -> Import:
-    """Read a motion file and carry it over to the humanoid or the biped.
+    """Read a motion file and retarget it to the humanoid or the biped.
 
-    The name says what the file is: ``.bvh``, ``.amc`` (with its ``.asf``), or ``.json`` or ``.txt`` for DeepMimic's.
-    Those hold the joints of the two characters, in metres; ``fps`` alone of the later options applies to them.
+    The suffix determines the format: ``.bvh``, ``.amc`` (with its ``.asf``), or ``.json`` or ``.txt`` for DeepMimic's
+    files. Those have the joints of the two characters, in metres; of the options after ``rate``, only ``fps`` applies.
 
     Args:
         path: The file.
         character: ``"humanoid"`` or ``"biped"``.
-        rate: Frames per second of the clip, or the nearest that divides it into whole frames.
-        fps: Frames per second of the file; None for what it says, or 120 for ``.amc``.
-        scale: Metres per unit of length; None for what the file says or the length of the legs suggests.
+        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
+        fps: Frames per second of the file; None for the file's own rate, or 120 for ``.amc``.
+        scale: Metres per unit of length; None for the file's own unit, or else a unit that fits the length of the legs.
         joint_map: See :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints`.
         skip: Frames to leave out at the beginning.
-        rest_frame: Frame, from 0 and before any are left out, in which the body stands upright, for a file whose rest
-            pose does not.
+        rest_frame: Frame, from 0 and before any are left out, in which the body stands upright, for files whose rest
+            pose does not stand upright.
         asf: Skeleton of an ``.amc`` file; None for the one beside it.
 
     Raises:
-        MotionFormatError: If the file cannot be used as it is.
+        MotionFormatError: If the file cannot be used.
         ValueError: If an argument is out of range, or does not apply to the file.
     """
     suffix = Path(path).suffix.lower()

@@ -1,4 +1,4 @@
-"""A recorded human body, seen as the character would be."""
+"""A recorded human body in the character's axes and units."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,23 +15,23 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.rotations import inverse, multiply
 
 UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
-"""Metres per unit of length: m, cm, mm, inches and CMU's. At most one of them makes a leg as long as legs are."""
+"""Metres per unit of length: m, cm, mm, inches and CMU's unit. At most one of them fits the length of a leg."""
 
 LEG_LENGTHS = (0.7, 1.0)
-"""Metres from hip to ankle, of adults."""
+"""Range of metres from hip to ankle, for adults."""
 
 SHORTEST_TRUNK = 0.1
-"""Metres from hips to chest below which the line between them does not say how the trunk leans."""
+"""Metres from hips to chest below which the line between them does not determine the lean of the trunk."""
 
 
 class Recording(NamedTuple):
     """Parts of a body, by name, in metres and the character's axes: x forward, y left, z up while it stands.
 
     Attributes:
-        positions: Where each part begins, shape ``(T, 3)``.
-        turns: Rotation of each since it stood, shape ``(T, 4)``.
-        standing: Where each began then, shape ``(3,)``.
-        times: Of the frames, from 0, shape ``(T,)``, in seconds.
+        positions: Position of each part's beginning, shape ``(T, 3)``.
+        turns: Rotation of each part from the standing pose, shape ``(T, 4)``.
+        standing: Position of each part's beginning in the standing pose, shape ``(3,)``.
+        times: Times of the frames in seconds, from 0, shape ``(T,)``.
     """
 
     positions: Mapping[str, Tensor]
@@ -44,9 +44,9 @@ class Recording(NamedTuple):
         return normalize(self.positions[end] - self.positions[start], dim=-1)
 
     def lean(self) -> float:
-        """Greatest angle in degrees from the vertical in the pose that is taken for standing: how far it is from it.
+        """Greatest angle in degrees from the vertical in the pose that is taken for standing.
 
-        Counted are the trunk and, forwards and backwards, the legs' bones: many rest poses spread the legs.
+        It covers the trunk and the forward and backward lean of the legs' bones; many rest poses spread the legs.
         """
         middle = (self.standing["right_hip"] + self.standing["left_hip"]) / 2
         trunk = self.standing["chest"] - middle
@@ -119,7 +119,7 @@ def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor], named: str)
 
 
 def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scale: float | None) -> float:
-    """Choose the unit, and check that it makes the legs as long as legs are."""
+    """Choose the unit, and check that it fits the length of the legs."""
     if scale is not None and not 0 < scale < math.inf:
         raise ValueError(f"scale={scale} is no unit of length: pass metres per unit, such as 0.01 for centimetres")
     length, (low, high) = _leg_length(positions), LEG_LENGTHS
@@ -140,7 +140,7 @@ def _leg_length(positions: Mapping[str, Tensor]) -> float:
 
 
 def _require_bones(source: SourceMotion, recording: Recording) -> None:
-    """Refuse limbs without length, which have no direction."""
+    """Check that all limbs have a length, and thus a direction."""
     for start, end in (*bones(LEG), *bones(ARM)):
         if start in recording.positions:
             lengths = torch.linalg.vector_norm(recording.positions[end] - recording.positions[start], dim=-1)
@@ -150,7 +150,7 @@ def _require_bones(source: SourceMotion, recording: Recording) -> None:
 
 
 def _require_no_jump(source: SourceMotion, recording: Recording) -> None:
-    """Refuse a recording that jumps, as those do whose first frame is a pose to calibrate with."""
+    """Check that the recording does not jump, as it does if its first frame is a pose for calibration."""
     for part, positions in recording.positions.items():
         fast = speeds(positions, recording.times) > TOP_SPEED
         if fast.any():

@@ -1,4 +1,4 @@
-"""Motion of any human skeleton, carried over to a character."""
+"""Retargeting the motion of any human skeleton to a character."""
 
 import math
 from collections.abc import Mapping
@@ -17,13 +17,13 @@ from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate
 
 BENT = math.radians(15)
-"""Flexion from which on a knee or an elbow shows the plane in which it bends."""
+"""Least flexion in radians at which a knee or an elbow determines its plane."""
 
 STILL = 0.15
-"""m/s. An ankle is slower while its foot is flat on the ground."""
+"""Speed in m/s below which an ankle's foot is flat on the ground."""
 
 STEEPEST = 0.05
-"""Metres per metre: three degrees, beyond which it is not the laboratory that slopes."""
+"""Largest slope of a laboratory in metres per metre, three degrees."""
 
 UP = AXES[2]
 
@@ -38,29 +38,30 @@ def retarget(
     skip: int = 0,
     rest_frame: int | None = None,
 ) -> tuple[MotionClip, float]:
-    """Carry a recorded motion over to the humanoid or the biped, and say how far from standing its rest pose is.
+    """Retarget a recorded motion to the humanoid or the biped, and measure the lean of its rest pose.
 
-    Parts of the character turn as those of the recorded body do, relative to a standing pose: legs and arms straight
-    down. A bone that the source's rest pose holds otherwise, such as the arms of a T, is first brought there the
-    shortest way. Knees and elbows are hinges: they flex by the angle between the bones, and thigh and upper arm are
-    twisted so that the hinge lies across the plane of the limb. The root goes with the middle of the hips; its path is
-    scaled by the length of the legs. A constant turn sets each foot flat, a constant shift the clip on the ground.
+    Parts of the character turn like the parts of the recorded body, relative to a standing pose with legs and arms
+    straight down. A bone with another direction in the source's rest pose, such as the arms in a T-pose, is first
+    brought there by the shortest rotation. Knees and elbows are hinges: they flex by the angle between the bones, and
+    thigh and upper arm are twisted so that the hinge is normal to the plane of the limb. The root follows the middle of
+    the hips; its path is scaled by the length of the legs. A constant rotation makes each foot flat, and a constant
+    shift puts the clip on the ground.
 
     Args:
         source: The motion.
         character: ``"humanoid"``, or ``"biped"``, which has neither head nor arms.
-        scale: Metres per unit of the source, or None for what the file says or else the length of the legs suggests.
-        rate: Frames per second of the clip, or the nearest that divides it into whole frames.
+        scale: Metres per unit of the source, or None for the file's unit or else one that fits the legs' length.
+        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
         joint_map: See :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints`.
         skip: Frames to leave out at the beginning.
-        rest_frame: Frame, from 0 and before any are left out, in which the source stands upright, for one whose rest
-            pose does not.
+        rest_frame: Frame, from 0 and before any are left out, in which the source stands upright, for sources whose
+            rest pose does not stand upright.
 
     Returns:
         The clip, and :meth:`Recording.lean` of the pose that was taken for standing.
 
     Raises:
-        MotionFormatError: If the motion cannot be that of a human body: in build, in size, or in speed.
+        MotionFormatError: If the build, size or speed is impossible for a human body.
         ValueError: If an argument is out of range.
     """
     require_human(character)
@@ -93,7 +94,7 @@ def leg_length(character: str) -> float:
 
 
 def _relative(parent: Tensor, child: Tensor) -> Tensor:
-    """Rotation of a part in the frame of the one that it hangs on, shape ``(T, 4)``."""
+    """Rotation of a part in the frame of its parent, shape ``(T, 4)``."""
     return multiply(inverse(parent), child)
 
 
@@ -105,16 +106,16 @@ def _flexed(angle: Tensor) -> Tensor:
 def _hinged(body: Recording, joints: tuple[str, str, str], *, forward: float) -> tuple[Tensor, Tensor]:
     r"""Fit a limb whose middle joint is a hinge about -y.
 
-    With the direction :math:`l` of its lower bone in the frame of the upper, whose own is -z, the upper bone is twisted
-    by the azimuth :math:`\varphi` of :math:`l`, so that none of it is sideways, and then
+    :math:`l` is the direction of the lower bone in the frame of the upper one, whose own direction is -z. The upper
+    bone is twisted by the azimuth :math:`\varphi` of :math:`l`, so that :math:`l` has no sideways component. Then
 
     .. math:: \theta = \operatorname{atan2}(l_x \cos \varphi + l_y \sin \varphi, -l_z)
 
-    A limb that is nearly straight has no plane: its twist is interpolated between the frames before and after.
+    A nearly straight limb has no plane: its twist is interpolated between the frames before and after.
 
     Args:
         body: The recorded motion.
-        joints: Of the limb, from the trunk outwards.
+        joints: Joints of the limb, from the trunk outwards.
         forward: 1 for a limb that flexes forward, -1 for one that flexes backward.
 
     Returns:
@@ -141,7 +142,7 @@ def _shortest(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _interpolated(angles: Tensor, known: Tensor) -> Tensor:
-    """Continuous angles over time, shape ``(T,)``, interpolated where they are not known; 0 if none is."""
+    """Continuous angles over time, shape ``(T,)``, interpolated where unknown; 0 if all are unknown."""
     if not known.any():
         return torch.zeros_like(angles)
     frames = known.nonzero().squeeze(-1).numpy()
@@ -149,7 +150,7 @@ def _interpolated(angles: Tensor, known: Tensor) -> Tensor:
 
 
 def _flat(body: Recording, ankle: str) -> Tensor:
-    """Turn a foot by a constant so that its sole is level, in the median, while it does not move, shape ``(T, 4)``."""
+    """Rotation of a foot, ``(T, 4)``, with a constant turn that levels its sole in the median while it stands still."""
     foot = body.turns[ankle]
     still = foot[_still(body, ankle)]
     if not len(still):
@@ -159,10 +160,10 @@ def _flat(body: Recording, ankle: str) -> Tensor:
 
 
 def _slope(body: Recording) -> Tensor:
-    r"""Rise of the ground per metre along x and y, shape ``(2,)``: laboratories are not quite level.
+    r"""Slope of the laboratory's ground along x and y, shape ``(2,)``, in metres per metre.
 
-    With the ankles that stand at :math:`(p, z)`, less their means, it is the plane through them, held flat where they
-    do not show one:
+    It is the slope of the plane through standing ankles at :math:`(p, z)`, relative to their mean, regularised towards
+    flat ground:
 
     .. math:: s = (\langle p p^T \rangle + r^2 I)^{-1} \langle p z \rangle, \quad r = 0.3 \text{ m}
     """
@@ -172,7 +173,7 @@ def _slope(body: Recording) -> Tensor:
     place, height = (standing - standing.mean(0)).split([2, 1], dim=-1)
     spread = place.mT @ place / len(place) + 0.3**2 * torch.eye(2, dtype=torch.float64)
     slope = torch.linalg.solve(spread, place.mT @ height / len(place)).squeeze(-1)
-    return slope if slope.norm() < STEEPEST else torch.zeros_like(slope)  # steeper: stairs, or a pit
+    return slope if slope.norm() < STEEPEST else torch.zeros_like(slope)  # steeper ground is stairs or a pit
 
 
 def _still(body: Recording, ankle: str) -> Tensor:

@@ -1,4 +1,4 @@
-"""Motion as files hold it: a skeleton of any shape, and what its joints do."""
+"""Motion as stored in files: a skeleton of any shape, and the motion of its joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +15,11 @@ AXES = torch.eye(3, dtype=torch.float64)
 
 
 class Pose(NamedTuple):
-    """Where the joints are, in the axes and the unit of the file.
+    """Positions and rotations of the joints, in the axes and the unit of the file.
 
     Attributes:
-        positions: Shape ``(*B, J, 3)``.
-        rotations: Quaternions from the rest pose, in which they are identity, shape ``(*B, J, 4)``.
+        positions: Positions of the joints, shape ``(*B, J, 3)``.
+        rotations: Quaternions relative to the rest pose, shape ``(*B, J, 4)``.
     """
 
     positions: Tensor
@@ -28,18 +28,18 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SourceMotion:
-    """A recorded motion on the skeleton that it came with.
+    """A recorded motion on its own skeleton.
 
-    A joint turns and shifts all that hangs on it. In the rest pose no joint is turned.
+    A joint turns and shifts all its descendants. In the rest pose no joint is turned.
 
     Args:
         path: The file.
-        names: Of the J joints, each after its parent.
-        parents: Index of each joint's parent, -1 for one without.
+        names: Names of the J joints, each after its parent.
+        parents: Index of each joint's parent, -1 for the root.
         translations: Position of each joint in the frame of its parent, shape ``(T, J, 3)``.
-        rotations: Of each joint relative to its parent, shape ``(T, J, 4)``.
+        rotations: Rotation of each joint relative to its parent, shape ``(T, J, 4)``.
         fps: Frames per second.
-        unit: Metres per unit of length, or None where the file does not say.
+        unit: Metres per unit of length, or None if unknown.
         lines: Line at which each frame begins.
     """
 
@@ -54,11 +54,11 @@ class SourceMotion:
 
     @property
     def rest(self) -> Pose:
-        """The rest pose, with the mean lengths of the motion, shapes ``(J, 3)`` and ``(J, 4)``."""
+        """The rest pose, with mean lengths over the motion, shapes ``(J, 3)`` and ``(J, 4)``."""
         return _forward_kinematics(self.parents, self.translations.mean(0), identities(len(self.names)))
 
     def poses(self) -> Pose:
-        """The poses in motion, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
+        """The poses of all frames, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
         return _forward_kinematics(self.parents, self.translations, self.rotations)
 
     def pose(self, frame: int) -> Pose:
@@ -75,7 +75,7 @@ class SourceMotion:
         """Leave out frames at the beginning.
 
         Raises:
-            ValueError: If less than two would remain.
+            ValueError: If fewer than two frames would remain.
         """
         if not 0 <= frames <= len(self.lines) - 2:
             raise ValueError(f"skip={frames} leaves less than two frames of {len(self.lines)}: pass a smaller number")
@@ -95,10 +95,10 @@ class SourceMotion:
 
 
 def frame_rate(fps: float | None, stated: float = 0.0) -> float:
-    """Return the frames per second that a user gives, or those that a file states.
+    """Return the user's frames per second, or else the file's.
 
     Raises:
-        ValueError: If what the user gives is no frame rate.
+        ValueError: If the user's value is no frame rate.
     """
     if fps is None:
         return stated
@@ -108,7 +108,7 @@ def frame_rate(fps: float | None, stated: float = 0.0) -> float:
 
 
 def identities(*shape: int) -> Tensor:
-    """Rotations by nothing, shape ``(*shape, 4)``."""
+    """Identity rotations, shape ``(*shape, 4)``."""
     return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(*shape, 1)
 
 

@@ -1,4 +1,4 @@
-"""Text files of numbers, read line by line with errors that name the line."""
+"""Text files of numbers, read line by line, with the line in errors."""
 
 import math
 import re
@@ -10,24 +10,24 @@ from typing import NamedTuple, Self
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 LARGEST_FILE = 64 * 2**20
-"""Bytes: a quarter of an hour of a whole body at 120 Hz."""
+"""Most bytes of a file: a quarter of an hour of a whole body at 120 Hz."""
 
 LARGEST_NUMBER = 1e7
-"""No position, in any unit, and no angle in degrees is larger."""
+"""Bound on positions in any unit, and on angles in degrees."""
 
 LARGEST_SKELETON = 1000
-"""Joints."""
+"""Most joints of a skeleton."""
 
 LARGEST_MOTION = 5_000_000
-"""Frames times joints, of which each takes a few hundred bytes."""
+"""Most frames times joints of a motion; each takes a few hundred bytes."""
 
 
 class Statement(NamedTuple):
-    """A line, or a part of one, as words.
+    """A line, or a part of a line, as words.
 
     Attributes:
         line: Number of the line, from 1.
-        words: At least one.
+        words: One or more words.
     """
 
     line: int
@@ -39,8 +39,8 @@ class TextFile:
     """The text of a motion file.
 
     Args:
-        path: Where it is from.
-        text: What it holds.
+        path: The file.
+        text: Content of the file.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class TextFile:
         """Read a file with any line endings; bytes that are not UTF-8 become replacement characters.
 
         Raises:
-            MotionFormatError: If it cannot be read, or is too large to be a motion.
+            MotionFormatError: If the file cannot be read, or is too large for a motion.
         """
         path = Path(path)
         try:
@@ -64,11 +64,11 @@ class TextFile:
         return cls(path, re.sub(r"\r\n?", "\n", content.decode("utf-8-sig", errors="replace")))
 
     def statements(self, *, separators: str = "", comment: str = "") -> Iterator[Statement]:
-        """Iterate over the lines that are not blank, as words.
+        """Iterate over the non-blank lines, as words.
 
         Args:
-            separators: Characters that are statements of their own wherever they stand.
-            comment: What begins a comment, which lasts to the end of the line.
+            separators: Characters that are separate statements anywhere in a line.
+            comment: Start of comments, which last to the end of the line.
         """
         for number, line in enumerate(self.text.split("\n"), start=1):
             content = line.partition(comment)[0] if comment else line
@@ -76,14 +76,14 @@ class TextFile:
             yield from (Statement(number, words) for part in parts if (words := part.split()))
 
     def error(self, message: str, line: int | None = None) -> MotionFormatError:
-        """Return an error to be raised about this file."""
+        """Return an error about this file."""
         return MotionFormatError(self.path, message, line)
 
     def numbers(self, words: Sequence[str], line: int) -> list[float]:
         """Convert words to finite numbers.
 
         Raises:
-            MotionFormatError: If one is not.
+            MotionFormatError: If a word is not a finite number.
         """
         numbers = [_number(word) for word in words]
         for word, number in zip(words, numbers, strict=True):
@@ -95,27 +95,27 @@ class TextFile:
         return [number for number in numbers if number is not None]
 
     def number(self, statement: Statement) -> float:
-        """Convert the word that follows a keyword to a number.
+        """Convert the word after a keyword to a number.
 
         Raises:
-            MotionFormatError: If there is not just one.
+            MotionFormatError: If the number of words is not one.
         """
         [number] = self._following(statement, 1)
         return number
 
     def vector(self, statement: Statement) -> list[float]:
-        """Convert the words that follow a keyword to three numbers.
+        """Convert the words after a keyword to three numbers.
 
         Raises:
-            MotionFormatError: If there are not three.
+            MotionFormatError: If the number of words is not three.
         """
         return self._following(statement, 3)
 
     def require_size(self, frames: int, joints: int) -> None:
-        """Refuse a motion that would fill the memory: a joint without channels takes no text.
+        """Check that a motion fits into memory, because joints without channels take no text.
 
         Raises:
-            MotionFormatError: If it is larger than any recording.
+            MotionFormatError: If the motion is larger than any recording.
         """
         if joints > LARGEST_SKELETON:
             raise self.error(f"has more than {LARGEST_SKELETON} joints: pass a file of one body")

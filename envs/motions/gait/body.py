@@ -1,4 +1,4 @@
-"""A walker's build, and how its pelvis, trunk, head and arms move with the stride."""
+"""A walker's build, and the motion of its pelvis, trunk, head and arms over the stride."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -15,23 +15,23 @@ from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, inverse, multiply, rotate
 
 PELVIS_LEAN, TRUNK_LEAN = 0.1, 0.53
-"""Into a turn, relative to :attr:`Course.lean`: the trunk's as measured."""
+"""Lean into a turn, relative to :attr:`Course.lean`; the trunk's is measured."""
 
 SHOULDER_LEAD, HEAD_LEAD = 0.035, 0.1
-"""Into a turn of more than 1 rad/s, in radians."""
+"""Lead into a turn of more than 1 rad/s, in radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class Build:
-    """What the generator needs to know of a body.
+    """Dimensions of a body that the generator uses.
 
     Args:
         trunk: Joint between pelvis and trunk.
-        height: Of the centre of mass at rest, in metres.
+        height: Height of the centre of mass at rest, in metres.
         leg: Bones of a leg.
-        sole: Of a foot.
-        pelvis_lever: By how much the centre of mass moves when the pelvis tilts, in metres per radian.
-        trunk_lever: The same for the trunk.
+        sole: Sole of a foot.
+        pelvis_lever: Shift of the centre of mass when the pelvis tilts, in metres per radian.
+        trunk_lever: Shift of the centre of mass when the trunk tilts, in metres per radian.
     """
 
     trunk: str
@@ -42,11 +42,11 @@ class Build:
     trunk_lever: float
 
     def overhang(self, pelvis: Tensor, trunk: Tensor) -> Tensor:
-        """How far the centre of mass leans out from over the root, shape ``(F, 2)``, legs apart.
+        """Horizontal distance from the root to the centre of mass, without the legs, shape ``(F, 2)``.
 
         Args:
-            pelvis: Orientation, shape ``(F, 4)``.
-            trunk: Orientation, shape ``(F, 4)``.
+            pelvis: Orientation of the pelvis, shape ``(F, 4)``.
+            trunk: Orientation of the trunk, shape ``(F, 4)``.
         """
         up = torch.tensor([0.0, 0.0, 1.0], dtype=pelvis.dtype)
         return (self.pelvis_lever * rotate(pelvis, up) + self.trunk_lever * rotate(trunk, up))[:, :2]
@@ -81,10 +81,10 @@ def build_of(character: str) -> Build:
 
 
 def pelvis_orientation(course: Course, activity: Tensor) -> Tensor:
-    """The pelvis goes forward with the leg that steps, and drops on the side of the leg that swings.
+    """Orientation of the pelvis, which turns forward with the stepping leg and drops on the side of the swinging leg.
 
     Args:
-        course: Of the walk.
+        course: Course of the walk.
         activity: From 0, standing, to 1, walking, shape ``(F,)``.
 
     Returns:
@@ -97,10 +97,10 @@ def pelvis_orientation(course: Course, activity: Tensor) -> Tensor:
 
 
 def trunk_orientation(course: Course, activity: Tensor) -> Tensor:
-    """The shoulders swing against the pelvis, and the trunk leans over the leg that takes the load.
+    """Orientation of the trunk, which swings against the pelvis and leans over the loaded leg.
 
     Args:
-        course: Of the walk.
+        course: Course of the walk.
         activity: From 0, standing, to 1, walking, shape ``(F,)``.
 
     Returns:
@@ -113,12 +113,12 @@ def trunk_orientation(course: Course, activity: Tensor) -> Tensor:
 
 
 def head_and_arms(course: Course, activity: Tensor, trunk: Tensor) -> dict[str, Tensor]:
-    """The head stays level and looks into turns; each arm swings with the other side's leg.
+    """Joints of the head, which stays level and looks into turns, and of the arms, which swing with the opposite leg.
 
     Args:
-        course: Of the walk.
+        course: Course of the walk.
         activity: From 0, standing, to 1, walking, shape ``(F,)``.
-        trunk: Orientation, shape ``(F, 4)``.
+        trunk: Orientation of the trunk, shape ``(F, 4)``.
 
     Returns:
         Quaternions ``(F, 4)`` of neck and shoulders and angles ``(F, 1)`` of the elbows, by name of the joint.
@@ -141,6 +141,6 @@ def head_and_arms(course: Course, activity: Tensor, trunk: Tensor) -> dict[str, 
 
 
 def _turned(course: Course, yaw: Tensor, left: Tensor, pitch: Tensor, lean: float) -> Tensor:
-    """Face along the course but for a yaw, leaning to the left and into the turn, and forward; angles in degrees."""
+    """Orientation along the course with a yaw, a roll to the left and into the turn, and a pitch; angles in degrees."""
     tilt = multiply(about_x(-torch.deg2rad(left) - lean * course.lean), about_y(torch.deg2rad(pitch)))
     return multiply(about_z(course.heading + torch.deg2rad(yaw)), tilt)

@@ -1,4 +1,4 @@
-"""The walks that ship with the project: drawn at random, with the speeds and turns of people who wander about."""
+"""The generated walks of the project: random, with the speeds and turns of people walking about."""
 
 import numpy as np
 import torch
@@ -10,17 +10,17 @@ from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.motions.smoothing import smoothed
 
 WALKS, DURATION = 7, 16.4
-"""Number and seconds: with their mirror images 229.6 s, as much as the paper's corpus."""
+"""Number of walks and their seconds: 229.6 s with mirror images, as much as the paper's corpus."""
 
 TURN_RATE_QUANTILES = ((0.0, 0.0), (0.12, 0.14), (0.5, 0.52), (0.9, 1.36), (0.95, 1.6), (0.985, 3.1), (1.0, 3.2))
-"""Of the absolute turn rate in rad/s. After smoothing, it has those of the paper's corpus: half of the time more than
-0.50, 5 % more than 1.61, 1 % more than 2.92."""
+"""Quantiles of the absolute turn rate in rad/s. After smoothing they match the paper's corpus: half of the time above
+0.50, 5 % above 1.61, 1 % above 2.92."""
 
 SPEED_QUANTILES = ((0.0, 0.35), (0.05, 0.48), (0.5, 0.97), (0.95, 1.46), (1.0, 1.55))
-"""Of the speed in m/s. After smoothing, and with the stops, 0.38, 0.92 and 1.42 are exceeded in 95, 50 and 5 %."""
+"""Quantiles of the speed in m/s. After smoothing, with stops, 95, 50 and 5 % of speeds exceed 0.38, 0.92 and 1.42."""
 
 SMOOTHING = 0.8
-"""Seconds, of the Hann window under which sudden turns are eased."""
+"""Length in seconds of the Hann window that smooths sudden turns."""
 
 SLOWING = 0.25
 """Mean loss of speed in m/s per rad/s of turn rate."""
@@ -29,13 +29,13 @@ SPREAD = 0.25
 """Standard deviation in m/s of speeds at equal turn rates."""
 
 CHANGE = 3.0
-"""Seconds over which speed and turn rate change."""
+"""Time scale in seconds of changes of speed and turn rate."""
 
 STOPS = ((1, 8.0), (4, 6.0))
-"""Walks and times in seconds at which the character stands still."""
+"""Walks in which the character stands still, and the times in seconds."""
 
 STOP, HALT = 0.8, 2.0
-"""Seconds of standing, and of slowing down before and speeding up after it."""
+"""Seconds of standing, and of slowing down before it and speeding up after it."""
 
 TURNING_SPEEDS = (("forward", 1.0, 0.0), ("slight", 1.05, 0.4), ("medium", 0.95, 0.8), ("sharp", 0.8, 1.4))
 
@@ -43,12 +43,12 @@ TURNING_SPEEDS = (("forward", 1.0, 0.0), ("slight", 1.05, 0.4), ("medium", 0.95,
 def walking_corpus(character: str, seed: int) -> dict[str, MotionClip]:
     """Generate 229.6 s of walking: seven walks and their mirror images, by name.
 
-    Speed and turn rate wander smoothly. Over the corpus they are distributed as in the paper's, which is mostly curved
-    walking near 1 m/s, and two of the walks come to a stop and go on.
+    Speed and turn rate vary smoothly. Over the corpus they are distributed as in the paper's corpus, which is mostly
+    curved walking near 1 m/s. Two of the walks come to a stop and go on.
 
     Args:
         character: ``"humanoid"`` or ``"biped"``.
-        seed: Of all that is random.
+        seed: Seed of the random walks.
     """
     speeds, turn_rates = _wandering(seed)
     clips = {}
@@ -59,7 +59,7 @@ def walking_corpus(character: str, seed: int) -> dict[str, MotionClip]:
 
 
 def turning_clips(character: str) -> dict[str, MotionClip]:
-    """Generate seven looping walks of one speed and turn rate each: straight ahead, and three turns to either side."""
+    """Generate seven looping walks with constant speed and turn rate: straight ahead, and three turns to each side."""
     clips: dict[str, MotionClip] = {}
     for name, speed, turn_rate in TURNING_SPEEDS:
         clip = stride(character, speed, turn_rate)
@@ -86,7 +86,7 @@ def _wandering(seed: int) -> tuple[Tensor, Tensor]:
 
 
 def _distributed(values: Tensor, quantiles: tuple[tuple[float, float], ...]) -> Tensor:
-    """Replace values by those of equal rank in a distribution."""
+    """Replace values by the values of equal rank in a distribution."""
     ranks = values.flatten().argsort().argsort().view_as(values) / (values.numel() - 1)
     shares, values_there = np.array(quantiles).T
     return torch.from_numpy(np.interp(ranks.numpy(), shares, values_there))

@@ -1,4 +1,4 @@
-"""The course of a walk: where it leads, when the feet step, and where they stand so that the body stays in balance."""
+"""The course of a walk: its path, the timing of steps, and footholds that keep the body in balance."""
 
 from dataclasses import dataclass
 
@@ -10,24 +10,24 @@ from torchrl_mcp.envs.motions.gait.curves import MID_STANCE
 GRAVITY = 9.81
 
 FOOTHOLD = 0.27
-"""Phase of its stride at which the body passes a foothold."""
+"""Phase of a foot's stride at which the body passes its foothold."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
     r"""A path over the ground, walked at a given speed and turn rate, in F frames.
 
-    The centre of mass is taken for an inverted pendulum of constant height h: with acceleration :math:`\ddot x` it is
-    in balance over the point :math:`z = x - \frac{h}{g} \ddot x`, outside of the path in a turn and behind it when
-    speeding up. Footholds lie to both sides of that point.
+    The centre of mass is modelled as an inverted pendulum of constant height h: with acceleration :math:`\ddot x` it is
+    in balance over the point :math:`z = x - \frac{h}{g} \ddot x`, outside the path in a turn and behind it when
+    speeding up. Footholds lie on both sides of that point.
 
     Args:
         fps: Frames per second.
-        speed: Shape ``(F,)``, in m/s.
-        turn_rate: Shape ``(F,)``, in rad/s, positive to the left.
-        heading: Direction of the path, shape ``(F,)``, in radians.
-        balance: The points z, shape ``(F, 2)``, in metres.
-        phase: Strides walked; the right heel strikes at whole numbers, the left halfway. Shape ``(F,)``.
+        speed: Speed in m/s, shape ``(F,)``.
+        turn_rate: Turn rate in rad/s, positive to the left, shape ``(F,)``.
+        heading: Direction of the path in radians, shape ``(F,)``.
+        balance: The points z in metres, shape ``(F, 2)``.
+        phase: Strides walked, shape ``(F,)``; the right heel strikes at whole numbers, the left halfway between.
     """
 
     fps: float
@@ -44,17 +44,17 @@ class Course:
 
     @property
     def lean(self) -> Tensor:
-        """Angle to the left, shape ``(F,)``, at which a turn's centrifugal force and gravity are in balance."""
+        """Lean to the left that balances a turn's centrifugal force and gravity, in radians, shape ``(F,)``."""
         return torch.atan(self.speed * self.turn_rate / GRAVITY)
 
     def frame_at(self, phase: Tensor) -> Tensor:
-        """When each phase is reached: frames counted from 0, not whole, of the same shape."""
+        """Fractional frames, counted from 0, at which phases are reached, of the same shape."""
         after = torch.searchsorted(self.phase, phase.contiguous()).clamp(1, len(self.phase) - 1)
         before = self.phase[after - 1]
         return after - 1 + (phase - before) / (self.phase[after] - before)
 
     def moment(self, side: "Side", phase: float) -> Tensor:
-        """For every frame, the frame in which a phase of the foot's cycle that goes on is reached, shape ``(F,)``."""
+        """For every frame, the frame at which the current cycle of the foot reaches a phase, shape ``(F,)``."""
         return self.frame_at((self.phase - side.offset - MID_STANCE).floor() + side.offset + phase)
 
 
@@ -63,9 +63,9 @@ class Side:
     """A side of the body.
 
     Args:
-        name: ``"right"`` or ``"left"``, with which the names of its bodies begin.
-        sign: Of y there.
-        offset: Phase at which its heel strikes.
+        name: ``"right"`` or ``"left"``, the prefix of the names of its bodies.
+        sign: Sign of y on this side.
+        offset: Phase at which the heel strikes.
     """
 
     name: str
@@ -77,14 +77,14 @@ SIDES = (Side("right", -1.0, 0.0), Side("left", 1.0, 0.5))
 
 
 def plan(speed: Tensor, turn_rate: Tensor, fps: float, height: float, start: int = 0) -> Course:
-    """Lay out a course that is at the origin in frame ``start``, along x, with the right heel striking.
+    """Plan a course that passes the origin along x in frame ``start``, when the right heel strikes.
 
     Args:
-        speed: Shape ``(F,)``, in m/s.
-        turn_rate: Shape ``(F,)``, in rad/s.
+        speed: Speed in m/s, shape ``(F,)``.
+        turn_rate: Turn rate in rad/s, shape ``(F,)``.
         fps: Frames per second.
-        height: Of the centre of mass, in metres.
-        start: A frame.
+        height: Height of the centre of mass, in metres.
+        start: Frame at the origin.
     """
     heading = accumulated(turn_rate, fps, start)
     forward, left = direction(heading), direction(heading + torch.pi / 2)
@@ -98,7 +98,7 @@ def plan(speed: Tensor, turn_rate: Tensor, fps: float, height: float, start: int
 def stride_rate(speed: Tensor, turn_rate: Tensor) -> Tensor:
     """Strides per second: 0.42 + 0.44 v, as measured at 0.7 to 1.5 m/s.
 
-    Who walks more slowly makes shorter steps rather than slower ones, and who turns sharply makes quicker ones.
+    Below that, steps become shorter rather than slower; in sharp turns they become quicker.
     """
     return 0.42 + 0.44 * speed + 0.25 * torch.exp(-((speed / 0.35) ** 2)) + 0.03 * turn_rate**2 + 0.006 * turn_rate**4
 
@@ -115,11 +115,11 @@ def accumulated(rate: Tensor, fps: float, start: int) -> Tensor:
 
 
 def between_frames(values: Tensor, frames: Tensor) -> Tensor:
-    """Read frames that are not whole by Catmull and Rom's cubic, which is smooth where lines would have corners.
+    """Interpolate at fractional frames by Catmull and Rom's cubic, which has no corners.
 
     Args:
-        values: Shape ``(F)`` or ``(F, D)``.
-        frames: Shape ``(*B)``.
+        values: Values at whole frames, shape ``(F)`` or ``(F, D)``.
+        frames: Fractional frames, shape ``(*B)``.
     """
     whole = frames.floor().clamp(1, len(values) - 3).long()
     u = (frames - whole).view(*frames.shape, *[1] * (values.ndim - 1))

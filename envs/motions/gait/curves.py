@@ -1,13 +1,12 @@
-"""The shapes of walking: how a foot and the joints move over a stride, as keys for splines.
+"""Curves of a foot and the joints over a stride, as keys for splines.
 
-The phase of a stride is 0 when the heel strikes. A foot's own cycle is counted from the middle of its stance, where it
-is flat on the ground, to the next: from 0.25 to 1.25. The keys follow published means of human walking near 1 m/s.
+The phase of a stride is 0 when the heel strikes. A foot's own cycle runs from one middle of its stance, where it is
+flat on the ground, to the next: from 0.25 to 1.25. The keys follow published means of human walking near 1 m/s.
 """
 
 from collections.abc import Sequence
 
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 MID_STANCE = 0.25
@@ -30,10 +29,10 @@ FOOT_PITCH = (
     (1.06, 9.0),
     (1.13, 0.0),
 )
-"""Degrees by which the toes point up; 0, flat on the ground, before and after."""
+"""Pitch of the foot in degrees, toes up; 0 (flat on the ground) before the first key and after the last."""
 
 ADVANCE = ((0.57, 0.0), (0.70, 0.10), (0.80, 0.405), (0.90, 0.785), (0.96, 0.944), (1.0, 0.994), (1.03, 1.0))
-"""Part of the way from one foothold to the next that the foot has gone."""
+"""Share of the way from one foothold to the next that the foot has covered."""
 
 CLEARANCE = (
     (0.57, 0.0),
@@ -46,22 +45,24 @@ CLEARANCE = (
     (1.00, 0.0075),
     (1.04, 0.0),
 )
-"""Height of the foot's lowest point in metres. The heel arrives with a little speed, as heels do."""
+"""Height of the foot's lowest point in metres. As in people, the heel lands with a small speed."""
 
 ASIDE = ((0.57, 0.0), (0.80, 0.04), (1.03, 0.0))
-"""Metres by which a foot swings outwards around the other leg in a curve, where that one points across its way."""
+"""Metres by which a foot swings outwards in a curve, around the other leg."""
 
 ROUNDING = ((0.80, 0.0), (0.90, 0.2), (1.02, 0.0))
-"""Angle in radians within which the lowest point of a swinging foot passes smoothly from toe to heel."""
+"""Pitch in radians over which the lowest point of a swinging foot moves smoothly from toe to heel."""
 
 
 def spline(keys: Sequence[tuple[float, float]] | Tensor, place: Tensor) -> Tensor:
-    """Cubic spline with continuous curvature and no slope at its ends, held beyond them.
+    """Evaluate a cubic spline with continuous curvature and zero slope at its ends, constant beyond them.
 
     Args:
-        keys: Pairs of place and value, two or more, by increasing place.
-        place: Where to read it, any shape, which is that of the result.
+        keys: Two or more pairs of place and value, by increasing place.
+        place: Places to evaluate, of any shape, which the result shares.
     """
+    from scipy.interpolate import CubicSpline  # slow to import, and only needed here
+
     places, values = torch.as_tensor(keys, dtype=torch.float64).T.numpy()
     curve = CubicSpline(places, values, bc_type="clamped")
     return torch.from_numpy(curve(place.clamp(places[0], places[-1]).numpy()))
@@ -73,5 +74,5 @@ def wave(phase: Tensor, peak: float, harmonic: int = 1) -> Tensor:
 
 
 def settled(amount: Tensor, scale: float) -> Tensor:
-    """From 0 for nothing to 1 for much more than ``scale``, without slope at 0: 1 - exp(-(amount / scale)^2)."""
+    """Saturate from 0 to 1 over ``scale``, with zero slope at 0: 1 - exp(-(amount / scale)^2)."""
     return -torch.expm1(-((amount / scale) ** 2))

@@ -1,4 +1,4 @@
-"""What the feet do: stand, roll over heel and toe, and swing to the next foothold."""
+"""The motion of the feet: they stand, roll over heel and toe, and swing to the next foothold."""
 
 from typing import NamedTuple
 
@@ -21,38 +21,38 @@ from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.rotations import about_y, about_z, multiply
 
 STEP_WIDTH, CURVE_WIDTH, SPOT_WIDTH = 0.12, 0.10, 0.20
-"""Between the ankles in metres: straight ahead, in a curve, and turning on the spot, where the legs would cross."""
+"""Distance between the ankles in metres: straight ahead, in a curve, and on the spot, where the legs could cross."""
 
 CURVED = 0.9
-"""Turn rate in rad/s, much above which feet stand and swing as in a curve."""
+"""Scale of the turn rate in rad/s above which feet stand and swing as in a curve."""
 
 TIGHT = 4.0
-"""Curvature in 1/m, much above which feet stand as in a turn on the spot."""
+"""Scale of the curvature in 1/m above which feet stand as in a turn on the spot."""
 
 CREEPING = 0.1
-"""Speed in m/s, added to the own for the curvature: who stands still walks no curve."""
+"""Speed in m/s that is added when computing the curvature, which is then 0 while standing."""
 
 TOE_OUT = 0.09
-"""In radians."""
+"""Angle of the feet outwards, in radians."""
 
 ARCH = 0.045
-"""Of the point under a foot that carries the body, ahead of the ankle."""
+"""Distance in metres from the ankle forward to the point under the foot that carries the body."""
 
 MEDIAL = 0.015
-"""Of that point, towards the other foot."""
+"""Distance in metres of that point towards the other foot."""
 
 
 LONG, SHORT = 0.4, 0.08
-"""Strides in metres: beyond the first the feet move as in normal walking, much below the second they stay down."""
+"""Lengths of strides in metres: above the first, feet move as in normal walking; far below the second, they rest."""
 
 
 class Sole(NamedTuple):
     """A foot's sole, a flat plate.
 
     Args:
-        heel: Place of its rear edge ahead of the ankle, negative, in metres.
-        toe: Place of its front edge.
-        depth: Of the sole below the ankle.
+        heel: Position of the rear edge ahead of the ankle, negative, in metres.
+        toe: Position of the front edge ahead of the ankle, in metres.
+        depth: Depth of the sole below the ankle, in metres.
     """
 
     heel: float
@@ -64,11 +64,11 @@ class Foot(NamedTuple):
     """A foot over F frames.
 
     Args:
-        heading: Shape ``(F,)``.
-        ankle: Position, shape ``(F, 3)``.
-        orientation: Quaternion, shape ``(F, 4)``.
-        support: The point of its foothold that carries the body, shape ``(F, 2)``.
-        unloaded: 0 while it may carry the body, 1 while it swings, shape ``(F,)``.
+        heading: Heading of the foot in radians, shape ``(F,)``.
+        ankle: Position of the ankle in metres, shape ``(F, 3)``.
+        orientation: Quaternion of the foot, shape ``(F, 4)``.
+        support: Point of the foothold that carries the body, in metres, shape ``(F, 2)``.
+        unloaded: 0 while the foot can carry the body, 1 while it swings, shape ``(F,)``.
     """
 
     heading: Tensor
@@ -81,13 +81,13 @@ class Foot(NamedTuple):
 def step(course: Course, side: Side, sole: Sole) -> Foot:
     """Move one foot along the course.
 
-    Every part of its motion shrinks with the distance to the next foothold, so that a foot whose next foothold is the
-    last one stays where it is: standing still is walking on the spot.
+    All parts of the motion shrink with the distance to the next foothold. A foot whose next foothold equals its last
+    one therefore does not move: standing still is walking on the spot.
 
     Args:
-        course: Of the walk, F frames.
-        side: Of the foot.
-        sole: Of the foot.
+        course: Course of the walk, F frames.
+        side: Side of the foot.
+        sole: Sole of the foot.
     """
     phase = _warped((course.phase - side.offset - MID_STANCE) % 1 + MID_STANCE, course.speed)
     last, following = course.moment(side, FOOTHOLD), course.moment(side, 1 + FOOTHOLD)
@@ -116,12 +116,12 @@ def rolled(pitch: Tensor, sole: Sole, rounding: Tensor) -> tuple[Tensor, Tensor]
     """Roll a foot over the edge of its heel, for positive pitch, or of its toe.
 
     Args:
-        pitch: Shape ``(F,)``, in radians.
-        sole: Of the foot.
-        rounding: Pitch within which the foot passes from one edge to the other without a corner, shape ``(F,)``.
+        pitch: Pitch of the foot in radians, shape ``(F,)``.
+        sole: Sole of the foot.
+        rounding: Pitch over which the foot passes smoothly from one edge to the other, shape ``(F,)``.
 
     Returns:
-        How far the ankle is ahead of where it is when the foot is flat, and its height above ground, each ``(F,)``.
+        Distance of the ankle ahead of its position with a flat foot, and its height above ground, each ``(F,)``.
     """
     sine, cosine = pitch.sin(), pitch.cos()
     edge = torch.where(pitch > 0, sole.heel, sole.toe)
@@ -131,7 +131,7 @@ def rolled(pitch: Tensor, sole: Sole, rounding: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _rolling(course: Course, side: Side, phase: Tensor) -> Tensor:
-    """From 0 to 1, how much a foot rolls: over the toes as the body gets ahead, over the heel as it lands ahead."""
+    """Amount of roll from 0 to 1: over the toes when the body is ahead, over the heel when the foot lands ahead."""
     last, off = (between_frames(course.balance, course.moment(side, at)) for at in (FOOTHOLD, TOE_OFF))
     strike, following = (between_frames(course.balance, course.moment(side, at)) for at in (1.0, 1 + FOOTHOLD))
     behind = settled(torch.linalg.vector_norm(off - last, dim=-1) / (TOE_OFF - FOOTHOLD), LONG)
@@ -140,7 +140,7 @@ def _rolling(course: Course, side: Side, phase: Tensor) -> Tensor:
 
 
 def _foothold(course: Course, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Position on the ground and heading of a flat foot beside the body as it is in some frames."""
+    """Position on the ground and heading of a flat foot beside the body in some frames."""
     heading = between_frames(course.heading, frames)
     turn_rate, speed = between_frames(course.turn_rate, frames), between_frames(course.speed, frames)
     width = STEP_WIDTH + (CURVE_WIDTH - STEP_WIDTH) * settled(turn_rate, CURVED)
@@ -150,7 +150,7 @@ def _foothold(course: Course, side: Side, frames: Tensor) -> tuple[Tensor, Tenso
 
 
 def _warped(phase: Tensor, speed: Tensor) -> Tensor:
-    """Shift the end of stance as it changes with speed, from a double support of 0.29 at 0.8 to 0.24 at 1.3 m/s."""
+    """Shift the end of stance with speed: double support falls from 0.29 at 0.8 m/s to 0.24 at 1.3 m/s."""
     double_support = (0.37 - 0.1 * speed).clamp(0.2, 0.36)
     shift = (1 + double_support) / 2 - TOE_OFF
     bump = (torch.pi * phase).sin() ** 2 / torch.sin(torch.tensor(torch.pi * TOE_OFF)) ** 2
@@ -158,6 +158,6 @@ def _warped(phase: Tensor, speed: Tensor) -> Tensor:
 
 
 def _swinging(phase: Tensor) -> Tensor:
-    """From 0 to 1 while the other heel takes over, and back to 0 after the own one has struck."""
+    """Rises from 0 to 1 while the other foot takes over the load, and falls to 0 after the foot's own heel strike."""
     transfer = TOE_OFF - 0.5
     return minimum_jerk((phase - 0.5) / transfer) - minimum_jerk((phase - 1) / transfer)

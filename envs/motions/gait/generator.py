@@ -1,4 +1,4 @@
-"""A generator of human walking: any speed and turn rate over time, for the characters with two human legs."""
+"""A generator of human walking with any speed and turn rate over time, for characters with human legs."""
 
 import math
 from collections.abc import Mapping
@@ -23,33 +23,33 @@ SLOWEST_FPS = 30.0
 FASTEST, SHARPEST = 1.6, 3.2
 
 MARGIN = 4.0
-"""Seconds walked before and after what is kept, in which the ends of the course are forgotten."""
+"""Seconds walked before and after the clip, so that the ends of the course do not affect it."""
 
 AHEAD, STRIDE = 0.053, 0.82
-"""Of the pelvis in metres, in long strides: the centre of pressure moves forward under a foot, from arch to toes."""
+"""Forward shift of the pelvis in long strides, and the scale of their length, in metres: pressure moves to the toes."""
 
 
 def walk(character: str, speed: Tensor, turn_rate: Tensor, *, fps: float = FPS) -> MotionClip:
     r"""Walk with given speeds and turn rates.
 
-    Feet stand on footholds beside the path, roll over heel and toe without sliding, and swing. Where the feet carry the
-    body, :math:`p(t)`, decides where the body is: the centre of mass is the only bounded motion of the inverted
-    pendulum :math:`\ddot x = \omega^2 (x - p)`, so that forces within the soles can make the character move like this,
+    Feet stand on footholds beside the path, roll over heel and toe without sliding, and swing. The point :math:`p(t)`
+    at which the feet carry the body determines the position of the body: the centre of mass is the only bounded motion
+    of the inverted pendulum :math:`\ddot x = \omega^2 (x - p)`, so that forces within the soles can produce it,
 
     .. math:: x(t) = \frac{\omega}{2} \int e^{-\omega |t - s|} p(s) \, ds, \qquad \omega^2 = g / h
 
-    Pelvis, trunk, head and arms swing about it as they do in people; the legs follow by inverse kinematics. Where speed
-    and turn rate are 0 the character stands. Both should change smoothly, over half a second or more.
+    Pelvis, trunk, head and arms swing about it as in people; the legs follow by inverse kinematics. If speed and turn
+    rate are 0, the character stands. Both should change smoothly, over half a second or more.
 
     Args:
         character: ``"humanoid"`` or ``"biped"``.
-        speed: Of every frame, shape ``(T,)``, in m/s; made for 0 to 1.5.
-        turn_rate: Of every frame, shape ``(T,)``, in rad/s, positive to the left; made for up to 1.6 at the speeds at
-            which people take such turns, 1.15 m/s - 0.25 m per rad, and up to 3 when almost on the spot.
+        speed: Speed of every frame in m/s, shape ``(T,)``; meant for 0 to 1.5.
+        turn_rate: Turn rate of every frame in rad/s, positive to the left, shape ``(T,)``; meant for up to 1.6 at the
+            speeds of people in such turns, 1.15 m/s - 0.25 m per rad, and for up to 3 when almost on the spot.
         fps: Frames per second.
 
     Raises:
-        ValueError: If the character does not walk like this, or speeds and turn rates are no profile.
+        ValueError: If the character cannot walk like this, or speeds or turn rates are out of range.
 
     Reference:
         Kajita et al., The 3D linear inverted pendulum mode, 2001, https://doi.org/10.1109/IROS.2001.973365
@@ -72,10 +72,10 @@ def stride(character: str, speed: float, turn_rate: float, *, strides: int = 1) 
     """Walk with constant speed and turn rate, as a clip that loops after whole strides.
 
     Args:
-        character: As for :func:`walk`.
-        speed: In m/s, more than 0.
-        turn_rate: In rad/s.
-        strides: How many.
+        character: ``"humanoid"`` or ``"biped"``.
+        speed: Speed in m/s, more than 0.
+        turn_rate: Turn rate in rad/s.
+        strides: Number of strides.
     """
     rate = torch.tensor([speed, turn_rate], dtype=torch.float64)
     duration = strides / float(stride_rate(*rate))
@@ -114,7 +114,7 @@ def _states(character: str, speed: Tensor, turn_rate: Tensor, fps: float, start:
 
 
 def _balanced(course: Course, feet: Mapping[Side, Foot], height: float) -> Tensor:
-    """Position of the centre of mass, shape ``(F, 2)``: the equation of :func:`walk`, its p given by the feet."""
+    """Position of the centre of mass, shape ``(F, 2)``, by the equation of :func:`walk` with p from the feet."""
     right, left = (feet[side] for side in SIDES)
     share = ((1 - right.unloaded) / (2 - right.unloaded - left.unloaded)).unsqueeze(-1)
     support = share * right.support + (1 - share) * left.support

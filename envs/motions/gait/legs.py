@@ -1,4 +1,4 @@
-"""How high the pelvis is over the feet, and how the legs reach from one to the other."""
+"""Height of the pelvis over the feet, and inverse kinematics of the legs."""
 
 import math
 from collections.abc import Mapping
@@ -14,35 +14,35 @@ from torchrl_mcp.envs.motions.gait.feet import Foot
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, inverse, multiply, rotate
 
 KNEE_KEYS = ((-0.005, 6.0), (0.12, 18.5), (0.30, 6.5))
-"""Phases of a leg's stance and flexion of its knee there, in degrees: at heel strike, under load, when passing over."""
+"""Phases of a leg's stance with the flexion of its knee in degrees: heel strike, loading, body over the foot."""
 
 TRAILING_KEYS = (12.0, 42.0, 0.0)
 """Least flexion of the other knee at these phases, in degrees."""
 
 STANDING_KNEE = 6.0
 LEAST_KNEE = 5.0
-"""Flexions in degrees: of a character that stands, and the least for which the pelvis comes down to keep it."""
+"""Flexions in degrees: when standing, and the least flexion, which the pelvis is lowered to keep."""
 
 SOFTNESS = 0.002
-"""In metres, of the choice of the lower of two heights."""
+"""Width in metres of the smooth minimum of two heights."""
 
 RELIEF = 0.16
-"""Half the time in seconds over which the pelvis gives way to a leg that would be stretched."""
+"""Half the time in seconds over which the pelvis is lowered for a leg that would be overstretched."""
 
 OUTWARD = 0.7
-"""Part of the angle between pelvis and foot that the hip turns, the rest being the ankle's."""
+"""Share of the angle between pelvis and foot that the hip turns; the ankle turns the rest."""
 
 INWARD = 0.1
-"""Angle in radians by which a foot may turn in and the hip with it; the ankle turns the rest, or knees would cross."""
+"""Largest inward turn of the hip in radians; the ankle turns the rest, because otherwise the knees would cross."""
 
 
 class Leg(NamedTuple):
     """A leg's bones.
 
     Args:
-        thigh: Length in metres.
-        shank: Length in metres.
-        hip: Of the left leg, relative to the root, shape ``(3,)``.
+        thigh: Length of the thigh in metres.
+        shank: Length of the shank in metres.
+        hip: Position of the left hip relative to the root, shape ``(3,)``.
     """
 
     thigh: float
@@ -50,7 +50,7 @@ class Leg(NamedTuple):
     hip: Tensor
 
     def hip_offset(self, side: Side, pelvis: Tensor) -> Tensor:
-        """From the root to a hip in the world, shape ``(F, 3)``, for orientations of the pelvis ``(F, 4)``."""
+        """Vector from the root to a hip in the world, ``(F, 3)``, for orientations of the pelvis ``(F, 4)``."""
         return rotate(pelvis, self.hip * torch.tensor([1.0, side.sign, 1.0]))
 
     def length(self, flexion: Tensor) -> Tensor:
@@ -61,17 +61,17 @@ class Leg(NamedTuple):
 def pelvis_height(
     course: Course, leg: Leg, pelvis: Tensor, position: Tensor, feet: Mapping[Side, Foot], activity: Tensor
 ) -> Tensor:
-    """Height of the root, shape ``(F,)``, for which the knees flex as they should.
+    """Height of the root, shape ``(F,)``, that results in the knee flexions of walking.
 
-    A spline runs through the heights that the leg under load asks for at three moments of each stance. Where a leg
-    would then be stretched, as on a sudden turn, the pelvis comes down.
+    A spline runs through the heights that the loaded leg needs at three moments of each stance. If a leg would then be
+    overstretched, as in a sudden turn, the pelvis is lowered.
 
     Args:
-        course: Of the walk.
-        leg: Bones.
-        pelvis: Orientation, shape ``(F, 4)``.
-        position: Of the root on the ground, shape ``(F, 2)``.
-        feet: Of each side.
+        course: Course of the walk.
+        leg: Bones of a leg.
+        pelvis: Orientation of the pelvis, shape ``(F, 4)``.
+        position: Horizontal position of the root, shape ``(F, 2)``.
+        feet: Foot of each side.
         activity: From 0, standing, to 1, walking, shape ``(F,)``.
     """
     keys = []
@@ -87,14 +87,14 @@ def pelvis_height(
 
 
 def leg_joints(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, forward: Tensor) -> tuple[Tensor, ...]:
-    """Solve a leg between hip and ankle; its plane stands upright over the direction between pelvis and foot.
+    """Solve a leg between hip and ankle, in a vertical plane whose heading is between those of pelvis and foot.
 
     Args:
-        leg: Bones.
-        side: Of the leg.
-        pelvis: Orientation, shape ``(F, 4)``.
-        root: Position, shape ``(F, 3)``.
-        foot: Of that side.
+        leg: Bones of a leg.
+        side: Side of the leg.
+        pelvis: Orientation of the pelvis, shape ``(F, 4)``.
+        root: Position of the root, shape ``(F, 3)``.
+        foot: Foot of that side.
         forward: Heading of the pelvis without its swing, shape ``(F,)``.
 
     Returns:
@@ -117,7 +117,7 @@ def leg_joints(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, f
 def _height_over(
     leg: Leg, side: Side, pelvis: Tensor, position: Tensor, foot: Foot, activity: Tensor, flexion: float
 ) -> Tensor:
-    """Height of the root with which the leg's knee has a flexion (in degrees, when walking), shape ``(F,)``."""
+    """Height of the root for a flexion of the leg's knee (in degrees, when walking), shape ``(F,)``."""
     hip = leg.hip_offset(side, pelvis)
     away = position + hip[:, :2] - foot.ankle[:, :2]
     length = leg.length(torch.deg2rad(STANDING_KNEE + activity * (flexion - STANDING_KNEE)))
@@ -126,7 +126,7 @@ def _height_over(
 
 
 def _relief(leg: Leg, pelvis: Tensor, root: Tensor, feet: Mapping[Side, Foot], fps: float) -> Tensor:
-    """How far the pelvis has to come down for no leg to be stretched, smooth in time, shape ``(F,)``."""
+    """Smooth lowering of the pelvis in metres so that no leg is overstretched, shape ``(F,)``."""
     limit = leg.length(torch.deg2rad(root.new_tensor(LEAST_KNEE)))
     excess = torch.zeros_like(root[:, 2])
     for side, foot in feet.items():

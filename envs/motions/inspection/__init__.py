@@ -1,1 +1,1 @@
-"""What clips look like: measures, feasibility and pictures."""
+"""Inspection of clips: measures, feasibility and pictures."""

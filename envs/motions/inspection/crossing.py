@@ -1,4 +1,4 @@
-"""How far the legs are apart: without self-collision nothing else says that they pass through each other."""
+"""Distance between the legs: without self-collision, nothing else shows that they pass through each other."""
 
 import mujoco
 import numpy as np
@@ -8,18 +8,18 @@ from torch import Tensor
 from torchrl_mcp.envs.motions.joints import character_model
 
 FURTHEST = 1.0
-"""Metres beyond which distances are not measured."""
+"""Largest distance in metres that is measured."""
 
 
 def legs_apart(character: str, qpos: Tensor) -> Tensor:
-    """Distance between the right and the left leg, feet included, by MuJoCo's own collision shapes.
+    """Distance between the right and the left leg, feet included, between MuJoCo's collision shapes.
 
     Args:
         character: Name of a character whose legs begin at ``right_hip`` and ``left_hip``.
         qpos: States, shape ``(T, nq)``.
 
     Returns:
-        Metres, shape ``(T,)``; negative by the depth to which the legs are in each other.
+        Distances in metres, shape ``(T,)``; negative by the depth of an overlap.
     """
     model = character_model(character)
     data = mujoco.MjData(model)
@@ -34,7 +34,7 @@ def legs_apart(character: str, qpos: Tensor) -> Tensor:
 
 
 def _leg_shapes(model: mujoco.MjModel, side: str) -> list[int]:
-    """Shapes that collide, of the hip's body and of all that hangs on it."""
+    """Colliding shapes of the hip's body and its descendants."""
     bodies = {model.body(f"{side}_hip").id}
     for body in range(model.nbody):
         if model.body_parentid[body] in bodies:

@@ -1,4 +1,4 @@
-"""Whether a body with mass, joint limits and motors could move as a clip says."""
+"""Feasibility of a clip for a body with mass, joint limits and motors."""
 
 from typing import NamedTuple
 
@@ -16,26 +16,26 @@ from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import to_rotation_vector
 
 TOUCH = 0.02
-"""Height in metres below which a point of a foot may be on the ground: captured feet are known no better."""
+"""Height in metres below which a point of a foot may be on the ground, the accuracy of captured feet."""
 
 STILL = 1.0
-"""Speed in m/s below which such a point may carry weight: what is faster passes over the ground."""
+"""Speed in m/s below which such a point may carry weight; faster points pass over the ground."""
 
 
 class Feasibility(NamedTuple):
-    """What speaks against a clip. All is best at 0 but for ``torque``, which should stay below 1.
+    """Measures of infeasibility of a clip. All are best at 0, except ``torque``, which should stay below 1.
 
     Args:
-        limit: Greatest angle in radians by which a joint is beyond its limit.
-        limit_joint: That joint, or the one that comes closest.
-        slide: Horizontal speed in m/s of the slowest point on the ground, exceeded in 5 % of the frames that have any.
+        limit: Greatest angle in radians by which a joint exceeds its limit.
+        limit_joint: That joint, or the joint closest to its limit.
+        slide: Horizontal speed in m/s of the slowest point on the ground, exceeded in 5 % of the frames with contact.
         penetration: Depth in metres of the lowest point of any body below the ground.
-        torque: Torque asked of a motor in ratio to what it can give, exceeded in 1 % of the frames.
+        torque: Ratio of required to available torque of a motor, exceeded in 1 % of the frames.
         torque_joint: The joint of that motor.
         airborne: Fraction of the frames without a foot on the ground.
-        imbalance: Distance in metres from the feet on the ground to the centre of pressure that the motion asks for,
-            exceeded in 5 % of the frames: what the ground would have to pull.
-        crossing: Greatest depth in metres to which one leg is in the other.
+        imbalance: Distance in metres from the feet on the ground to the required centre of pressure, exceeded in 5 % of
+            the frames: beyond the feet, the ground would have to pull.
+        crossing: Greatest depth in metres of one leg in the other.
     """
 
     limit: float
@@ -50,14 +50,14 @@ class Feasibility(NamedTuple):
 
 
 def feasibility(clip: MotionClip) -> Feasibility:
-    """Judge a clip by kinematics and by inverse dynamics without a controller.
+    """Measure a clip by kinematics and by inverse dynamics without a controller.
 
-    Inverse dynamics gives the force and the moment that have to act on the root. They can only come from the ground:
-    they are handed to the feet on it, in the ratio in which the centre of pressure lies between them, and what the
-    motors have to give follows.
+    Inverse dynamics yields the force and the moment that have to act on the root. They can only come from the ground,
+    so they are split between the feet on it, by the position of the centre of pressure between them. The torques of the
+    motors follow.
 
     Args:
-        clip: Of a character under PD control, above a ground at z = 0.
+        clip: Clip of a character under PD control, with the ground at z = 0.
     """
     states = body_states(clip.character, clip.qpos, clip.qvel)
     feet = [contact_points(clip.character, foot, states) for foot in CHARACTERS[clip.character].feet]
@@ -104,7 +104,7 @@ def _limits(clip: MotionClip) -> tuple[float, str]:
 
 
 def _dynamics(clip: MotionClip, points: list[Tensor], grounded: list[Tensor]) -> tuple[float, str, float]:
-    """Torque in ratio to the motors' limits, the joint where it is greatest, and the imbalance."""
+    """Greatest ratio of torque to the motor's limit, its joint, and the imbalance."""
     wrench, inverse = _inverse_dynamics(clip)
     force, moment = wrench[:, :3], wrench[:, 3:]
     pressure = np.stack([-moment[:, 1], moment[:, 0]], axis=-1) / np.maximum(force[:, 2:], 1e-6)
@@ -141,7 +141,7 @@ def _inverse_dynamics(clip: MotionClip) -> tuple[np.ndarray, np.ndarray]:
 def _motor_torques(
     clip: MotionClip, inverse: np.ndarray, wrench: np.ndarray, centres: list[Tensor], shares: Tensor
 ) -> np.ndarray:
-    """Torques of the motors, ``(T, nu)``, with the ground acting on the feet by their shares ``(T, 2)`` of the load."""
+    """Torques of the motors, ``(T, nu)``, with the load split between the feet by ``shares``, ``(T, 2)``."""
     model = character_model(clip.character)
     data = mujoco.MjData(model)
     feet = [model.body(name).id for name in CHARACTERS[clip.character].feet]
@@ -160,13 +160,13 @@ def _motor_torques(
 
 
 def _centre(positions: Tensor, grounded: Tensor) -> Tensor:
-    """Mean of the points on the ground, ``(T, 3)``; of all of them where none is."""
+    """Mean of the points on the ground, ``(T, 3)``; of all points if none is on the ground."""
     weight = torch.where(grounded.any(-1, keepdim=True), grounded, torch.ones_like(grounded)).to(positions.dtype)
     return (weight.unsqueeze(-1) * positions).sum(1) / weight.sum(1, keepdim=True)
 
 
 def _shares(pressure: Tensor, centres: list[Tensor], down: list[Tensor]) -> Tensor:
-    """Parts of the load on two feet, ``(T, 2)``: in double support as the pressure lies between them."""
+    """Shares of the load on two feet, ``(T, 2)``: in double support by the position of the pressure between them."""
     first, second = centres[0][:, :2], centres[1][:, :2]
     between = second - first
     part = ((pressure - first) * between).sum(-1) / between.square().sum(-1)
@@ -175,10 +175,10 @@ def _shares(pressure: Tensor, centres: list[Tensor], down: list[Tensor]) -> Tens
 
 
 def _distance_outside(point: Tensor, corners: Tensor, valid: Tensor) -> Tensor:
-    """Distance, ``(T,)``, of points ``(T, 2)`` from the convex hull of some of the corners ``(T, P, 2)``; 0 inside.
+    """Distance, ``(T,)``, of points ``(T, 2)`` from the convex hull of the valid corners ``(T, P, 2)``; 0 inside.
 
-    A point is outside by the most by which it is beyond all corners in any direction. Of these, 90 are tried, which is
-    wrong by less than one part in a thousand.
+    The distance is the largest excess over all corners in any direction. It is taken over 90 directions, with an error
+    of less than one part in a thousand.
     """
     angle = torch.arange(90, dtype=point.dtype) * (2 * torch.pi / 90)
     directions = torch.stack([angle.cos(), angle.sin()])

@@ -21,11 +21,11 @@ FILM_FPS = 25.0
 
 
 def pictures(clip: MotionClip, times: Tensor, *, size: int, follow_heading: bool) -> Iterator[Tensor]:
-    """Draw a clip from the character's right, so that it goes to the right.
+    """Draw a clip from the character's right, so that it moves to the right in the picture.
 
     Args:
         clip: The clip.
-        times: In seconds since its first frame, shape ``(M,)``.
+        times: Times in seconds since the first frame, shape ``(M,)``.
         size: Width and height in pixels.
         follow_heading: Turn the camera with the character, not only move it along.
 
@@ -60,7 +60,7 @@ def _scene(character: str) -> mujoco.MjModel:
 
 
 def contact_sheet(clip: MotionClip, *, columns: int = 8, rows: int = 3, size: int = 200) -> Tensor:
-    """Draw moments of a clip at equal intervals, its beginning and its end included, from left to right and down.
+    """Draw a clip at equal intervals, including its beginning and end, row by row.
 
     Args:
         clip: The clip.
@@ -87,7 +87,7 @@ def save_film(clip: MotionClip, path: str | Path, *, seconds: float = math.inf, 
     Args:
         clip: The clip.
         path: The file.
-        seconds: The most to draw.
+        seconds: Longest duration to draw.
         size: Width and height in pixels.
     """
     times = torch.arange(0, min(clip.duration, seconds), 1 / FILM_FPS, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What a walk looks like from its own direction of progression: angles and places over time."""
+"""Angles and positions of a walk over time, relative to its direction of progression."""
 
 from typing import NamedTuple
 
@@ -14,19 +14,19 @@ from torchrl_mcp.envs.rotations import heading, rotate
 
 
 class RootSignals(NamedTuple):
-    """Of pelvis and trunk, each ``(T,)`` unless stated, in metres, seconds and degrees but for the heading.
+    """Signals of pelvis and trunk, each ``(T,)`` unless stated, in metres, m/s and degrees except the heading.
 
     Args:
-        position: On the ground, shape ``(T, 2)``.
-        path: The same, smoothed.
-        heading: Smoothed, in radians.
-        speed: Along the heading.
-        height: Of the root.
-        sway: To the left of the path.
-        pelvis_yaw: Relative to the heading.
-        pelvis_list: Left side up.
-        trunk_yaw: Relative to the heading.
-        trunk_roll: To the left.
+        position: Horizontal position of the root, shape ``(T, 2)``.
+        path: Smoothed position, shape ``(T, 2)``.
+        heading: Smoothed heading in radians.
+        speed: Speed along the heading.
+        height: Height of the root.
+        sway: Distance to the left of the path.
+        pelvis_yaw: Yaw of the pelvis relative to the heading.
+        pelvis_list: Roll of the pelvis, left side up.
+        trunk_yaw: Yaw of the trunk relative to the heading.
+        trunk_roll: Roll of the trunk to the left.
     """
 
     position: Tensor
@@ -42,20 +42,20 @@ class RootSignals(NamedTuple):
 
 
 class LegSignals(NamedTuple):
-    """Of a leg and the arm on its side, each ``(T,)``, in metres, m/s and degrees.
+    """Signals of a leg and the arm on its side, each ``(T,)``, in metres, m/s and degrees.
 
     Args:
-        ahead: Of the ankle, along the heading from the root.
-        toe_ahead: Of the toes.
-        across: Of the ankle, to the left of the path.
-        thigh: Angle forward from the vertical.
-        knee: Flexion.
+        ahead: Distance of the ankle ahead of the root, along the heading.
+        toe_ahead: Distance of the toes ahead of the root, along the heading.
+        across: Distance of the ankle to the left of the path.
+        thigh: Angle of the thigh forward from the vertical.
+        knee: Flexion of the knee.
         ankle: Dorsiflexion in the plane of progression.
-        pitch: Of the foot, toes up.
-        toe_height: Of the sole at the toes.
-        ankle_speed: Horizontal.
-        arm: Angle of the upper arm forward from the vertical; NaN without arms, as is the next.
-        elbow: Flexion.
+        pitch: Pitch of the foot, toes up.
+        toe_height: Height of the sole at the toes.
+        ankle_speed: Horizontal speed of the ankle.
+        arm: Angle of the upper arm forward from the vertical; NaN without arms.
+        elbow: Flexion of the elbow; NaN without arms.
     """
 
     ahead: Tensor
@@ -72,11 +72,11 @@ class LegSignals(NamedTuple):
 
 
 def root_signals(clip: MotionClip, states: BodyStates, window: float) -> RootSignals:
-    """Follow pelvis and trunk.
+    """Return the signals of pelvis and trunk.
 
     Args:
-        clip: Of T frames.
-        states: Of its bodies.
+        clip: Clip of T frames.
+        states: States of its bodies.
         window: Length in seconds of the Hann window that smooths path and heading.
     """
     trunk = states.orientations[:, 1]  # the body above the pelvis
@@ -101,7 +101,7 @@ def root_signals(clip: MotionClip, states: BodyStates, window: float) -> RootSig
 
 
 def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: RootSignals) -> LegSignals:
-    """Follow the leg and the arm of a side, ``"right"`` or ``"left"``."""
+    """Return the signals of the leg and the arm of a side, ``"right"`` or ``"left"``."""
     names, model = body_names(clip.character), character_model(clip.character)
     forward, left = _axes(root.heading)
     foot = names.index(f"{side}_ankle")
@@ -141,13 +141,13 @@ def unwrapped(angles: Tensor) -> Tensor:
 
 
 def _axes(facing: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors on the ground forward and to the left of headings ``(T,)``, each ``(T, 2)``."""
+    """Horizontal unit vectors forward and to the left of headings ``(T,)``, each ``(T, 2)``."""
     cosine, sine = facing.cos(), facing.sin()
     return torch.stack([cosine, sine], dim=-1), torch.stack([-sine, cosine], dim=-1)
 
 
 def _axis(orientations: Tensor, index: int) -> Tensor:
-    """One of the bodies' own axes in the world, shape ``(T, 3)``."""
+    """One of a body's axes in the world, shape ``(T, 3)``."""
     return rotate(orientations, torch.eye(3, dtype=orientations.dtype)[index])
 
 

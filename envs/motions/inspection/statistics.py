@@ -1,4 +1,4 @@
-"""Measures of a walk, taken from its poses alone."""
+"""Measures of a walk, from its poses alone."""
 
 from typing import NamedTuple
 
@@ -13,45 +13,45 @@ from torchrl_mcp.envs.motions.smoothing import smoothed
 from torchrl_mcp.envs.rotations import heading
 
 LEAST_FPS = 60.0
-"""Below which a clip is resampled, for events to be found to a hundredth of a second."""
+"""Frame rate below which a clip is resampled, to locate events within a hundredth of a second."""
 
 
 class GaitStatistics(NamedTuple):
     """Measures of S strides, each of shape ``(S,)``, in metres, seconds and degrees.
 
-    Angles of thigh, arm and foot are those in the plane of progression, forward and toes up being positive; list and
-    roll are about the direction of progression. A range is the greatest value minus the least. Arms are NaN where there
-    are none.
+    Angles of thigh, arm and foot are in the plane of progression, positive forward and toes up; list and roll are about
+    the direction of progression. A range is the greatest value minus the least. Percentages are of the stride. Measures
+    of arms are NaN without arms.
 
     Args:
-        stride_time: From a heel strike to the next of the same foot.
-        speed: Along the heading, in m/s.
-        turn_rate: To the left, in rad/s.
-        step_width: Between the ankles in their mid-stances, across the heading.
+        stride_time: Time from a heel strike to the next of the same foot.
+        speed: Speed along the heading, in m/s.
+        turn_rate: Turn rate to the left, in rad/s.
+        step_width: Distance between the ankles in their mid-stances, across the heading.
         stance: Fraction of the stride with the foot down.
-        double_support: Fraction with both feet down, both times together.
+        double_support: Fraction of the stride with both feet down.
         bob: Range of the root's height.
-        sway: Range of the root's way to the sides of its path.
-        thigh_forward: Greatest angle.
-        thigh_back: Least angle.
-        knee_strike: Flexion at heel strike.
-        knee_loading: Greatest flexion in the first 30 % of the stride.
-        knee_stance: Least flexion between 20 and 50 %.
-        knee_swing: Greatest flexion.
-        ankle_dorsiflexion: Greatest between 30 and 62 %.
+        sway: Range of the root's distance from its path.
+        thigh_forward: Greatest angle of the thigh.
+        thigh_back: Least angle of the thigh.
+        knee_strike: Flexion of the knee at heel strike.
+        knee_loading: Greatest flexion of the knee in the first 30 %.
+        knee_stance: Least flexion of the knee between 20 and 50 %.
+        knee_swing: Greatest flexion of the knee.
+        ankle_dorsiflexion: Greatest dorsiflexion between 30 and 62 %.
         ankle_plantarflexion: Least dorsiflexion between 55 and 85 %.
-        pitch_strike: Of the foot at heel strike.
-        pitch_toe_off: Least pitch of the foot, which is that shortly after toe-off.
-        pelvis_yaw: Range.
-        pelvis_list: Range.
-        shoulder_yaw: Range, of the trunk.
-        yaw_correlation: Between pelvis and trunk: -1 where they swing against each other.
-        trunk_roll: Range.
+        pitch_strike: Pitch of the foot at heel strike.
+        pitch_toe_off: Least pitch of the foot, shortly after toe-off.
+        pelvis_yaw: Range of the pelvis's yaw.
+        pelvis_list: Range of the pelvis's list.
+        shoulder_yaw: Range of the trunk's yaw.
+        yaw_correlation: Correlation of yaw between pelvis and trunk: -1 if they swing against each other.
+        trunk_roll: Range of the trunk's roll.
         trunk_lean: Mean roll of the trunk to the left.
         arm_swing: Range of the upper arm's angle.
-        elbow_mean: Mean flexion.
-        elbow_swing: Range of flexion.
-        toe_clearance: Height of the toes' sole that is exceeded in 5 % of the stride, over that exceeded in 95 %.
+        elbow_mean: Mean flexion of the elbow.
+        elbow_swing: Range of the elbow's flexion.
+        toe_clearance: Difference of the 95 % and 5 % quantiles of the height of the sole at the toes.
         slide: Median horizontal speed of the ankle between 15 and 40 %, in m/s.
     """
 
@@ -87,7 +87,7 @@ class GaitStatistics(NamedTuple):
 
     @property
     def stride_length(self) -> Tensor:
-        """Way along the heading in a stride, in metres."""
+        """Distance along the heading in a stride, in metres."""
         return self.speed * self.stride_time
 
     @property
@@ -105,10 +105,10 @@ class GaitStatistics(NamedTuple):
 
 
 def gait_statistics(clip: MotionClip) -> GaitStatistics:
-    """Measure every whole stride of a humanoid or biped, of either foot, that is not interrupted by a stop.
+    """Measure every complete stride of a humanoid or biped, of either foot, without a stop.
 
     Args:
-        clip: Of a character whose legs have thigh, shank and foot; a loop is unrolled.
+        clip: Clip of a character whose legs have thigh, shank and foot; a loop is unrolled.
     """
     clip = _prepared(clip)
     states = body_states(clip.character, clip.qpos, clip.qvel)
@@ -116,7 +116,7 @@ def gait_statistics(clip: MotionClip) -> GaitStatistics:
     strides = find_strides({side: leg_signals(clip, states, side, coarse) for side in ("right", "left")}, clip.fps)
     if not strides:
         return GaitStatistics(*torch.empty(len(GaitStatistics._fields), 0, dtype=torch.float64))
-    # A Hann window two strides long removes all that repeats with the stride.
+    # A Hann window of two strides removes everything that repeats with the stride.
     typical = torch.tensor([stride.end - stride.start for stride in strides]).median()
     root = root_signals(clip, states, window=2 * float(typical) / clip.fps)
     legs = {side: leg_signals(clip, states, side, root) for side in ("right", "left")}
@@ -128,8 +128,8 @@ def speed_and_turn_rate(clip: MotionClip, window: float = 1.0) -> tuple[Tensor, 
     """Speed in m/s along the heading, and turn rate in rad/s, of the root at every frame, each ``(T,)``.
 
     Args:
-        clip: Any.
-        window: Length in seconds of the Hann window that smooths them.
+        clip: Any clip.
+        window: Length in seconds of the Hann window for smoothing.
     """
     yaw = smoothed(unwrapped(heading(clip.qpos[:, 3:7])), clip.fps, window)
     forward = (clip.qvel[:, :2] * torch.stack([yaw.cos(), yaw.sin()], dim=-1)).sum(-1)
@@ -137,7 +137,7 @@ def speed_and_turn_rate(clip: MotionClip, window: float = 1.0) -> tuple[Tensor, 
 
 
 def _prepared(clip: MotionClip) -> MotionClip:
-    """At least ten seconds of a loop, at a frame rate that is high enough."""
+    """Return the clip with at least ten seconds of a loop, and a sufficient frame rate."""
     if clip.loop:
         times = torch.arange(0, max(10.0, clip.duration), 1 / clip.fps, dtype=torch.float64)
         clip = MotionClip(clip.character, clip.at(times), clip.fps)

@@ -9,13 +9,13 @@ from torch import Tensor
 from torchrl_mcp.envs.motions.inspection.signals import LegSignals
 
 STRIKE_DELAY = 0.019
-"""Seconds by which a heel strikes after the ankle was furthest ahead of the root, as other measurements show."""
+"""Delay in seconds of a heel strike after the ankle is furthest ahead of the root, from other measurements."""
 
 SWING = 0.03
-"""Metres by which an ankle passes the root in a step: less to and fro is none."""
+"""Distance in metres by which an ankle passes the root in a step; smaller movements are no steps."""
 
 LONGEST = 1.8
-"""Seconds of a stride: what takes longer includes a stop."""
+"""Longest stride in seconds; longer ones include a stop."""
 
 
 class Stride(NamedTuple):
@@ -23,11 +23,11 @@ class Stride(NamedTuple):
 
     Args:
         side: ``"right"`` or ``"left"``.
-        start: Heel strike.
-        end: Next heel strike.
-        toe_off: When the foot leaves the ground.
-        other_start: Heel strike of the other foot.
-        other_toe_off: When the other foot leaves the ground.
+        start: Frame of the heel strike.
+        end: Frame of the next heel strike.
+        toe_off: Frame in which the foot leaves the ground.
+        other_start: Frame of the other foot's heel strike.
+        other_toe_off: Frame in which the other foot leaves the ground.
     """
 
     side: str
@@ -49,13 +49,13 @@ class Stride(NamedTuple):
 
 
 def find_strides(legs: Mapping[str, LegSignals], fps: float) -> list[Stride]:
-    """Find all whole strides.
+    """Find all complete strides.
 
-    A heel strikes 19 ms after its ankle was furthest ahead of the root; a foot leaves the ground when its toes are
+    A heel strikes 19 ms after its ankle is furthest ahead of the root; a foot leaves the ground when its toes are
     furthest behind.
 
     Args:
-        legs: Of both sides.
+        legs: Signals of both legs.
         fps: Frames per second.
     """
     delay = round(STRIKE_DELAY * fps)
@@ -75,7 +75,7 @@ def find_strides(legs: Mapping[str, LegSignals], fps: float) -> list[Stride]:
 
 
 def _excursions(signal: Tensor) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Whole intervals of frames in which a signal is above, and in which it is below zero, by more than ``SWING``."""
+    """Complete intervals of frames with a signal above ``SWING``, and with a signal below ``-SWING``."""
     away = (signal.abs() > SWING).nonzero().squeeze(-1)
     signs = signal[away].sign()
     turns = (signs.diff() != 0).nonzero().squeeze(-1) + 1

@@ -10,17 +10,17 @@ from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import heading
 
 SWINGING = 1.0
-"""m/s. A foot that moves faster is in the air."""
+"""Speed in m/s above which a foot is in the air."""
 
 RUNNING = 2.0
-"""m/s. Nobody walks faster; runners pass their feet in the air."""
+"""Speed in m/s above which people run; both feet of a runner are in the air when they pass each other."""
 
 
 class Summary(NamedTuple):
-    """What a clip is like.
+    """Summary of a clip.
 
     Attributes:
-        duration: Seconds, of one cycle where it loops.
+        duration: Duration in seconds, or of one cycle if it loops.
         speed: Mean horizontal speed of the root, in m/s.
         turn_rate: Mean absolute rate of the root's heading, in rad/s.
         slide: See :func:`foot_slide`, in m/s.
@@ -33,7 +33,7 @@ class Summary(NamedTuple):
 
 
 def summarised(clip: MotionClip) -> Summary:
-    """Sum up a clip of a character with two feet."""
+    """Summarise a clip of a character with two feet."""
     steps = clip.qpos[:, :2].diff(dim=0).norm(dim=-1)
     turns = heading(clip.qpos[:, 3:7]).diff()
     turns = torch.atan2(turns.sin(), turns.cos()).abs()
@@ -46,9 +46,10 @@ def summarised(clip: MotionClip) -> Summary:
 
 
 def foot_slide(clip: MotionClip) -> float:
-    """Median horizontal speed of an ankle while the other one swings past it, in m/s; NaN if nobody walks.
+    """Median horizontal speed of an ankle while the other one swings past it, in m/s; NaN without walking.
 
-    At that moment the foot should stand. A recording whose rotations are read in a wrong order slides at 0.2 to 1 m/s.
+    At that moment the foot should stand. If the rotations of a recording are read in the wrong order, it slides at 0.2
+    to 1 m/s.
     """
     names, bodies = body_names(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet]

@@ -1,0 +1,83 @@
+import json
+import math
+import random
+import sys
+from datetime import UTC, datetime
+
+import pytest
+
+from torchrl_mcp.cli.report import main
+from torchrl_mcp.report.page import report
+from torchrl_mcp.report.results import find_runs
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.5])
+def test_a_run_that_has_just_begun_makes_a_report(write_run, parse_page, progress):
+    folder = write_run("run", progress=progress, preset=None)
+    html = report(*find_runs([folder]), moment=datetime.now(UTC))["report.html"]
+    assert f"{progress:.0%} trained" in parse_page(html).text
+
+
+def test_damaged_folders_alone_make_a_report(write_run, parse_page):
+    folder = write_run("run")
+    (folder / "config.yaml").write_text("[")
+    assert "1 damaged" in parse_page(report(*find_runs([folder]), moment=datetime.now(UTC))["report.html"]).text
+
+
+JUNK = [None, True, -1, 1e400, math.nan, "", "many", "<b>", [], [[]], {}, {"a": {}}, "9" * 400]
+
+
+def spoil(content, generator):
+    """Replace, remove or add a value somewhere in a tree of objects."""
+    inside = [content] + [value for value in content.values() if isinstance(value, dict)]
+    target = generator.choice(inside)
+    key = generator.choice([*target, "surprise"]) if target else "surprise"
+    if generator.random() < 0.2:
+        target.pop(key, None)
+    else:
+        target[key] = generator.choice(JUNK)
+
+
+def test_however_the_files_of_runs_are_damaged_the_others_are_reported(write_run, tmp_path):
+    generator = random.Random(0)
+    write_run("whole", score=0.625, method="scratch")
+    for number in range(150):
+        folder = write_run(f"damaged{number}", score=0.5, seed=number + 1)
+        file = folder / ("evaluation.json", "origin.json")[number % 2]
+        content = json.loads(file.read_text())
+        for _ in range(1 + number % 3):
+            spoil(content, generator)
+        file.write_text(json.dumps(content))
+    runs, damaged = find_runs([tmp_path])
+    assert len(runs) + len(damaged) == 151
+    pages = report(runs, damaged, moment=datetime.now(UTC))
+    faulty = [run for run in runs if run.state == "damaged"]
+    assert 30 < len(faulty) < 150
+    assert all(str(run.path) in pages["report.md"] for run in faulty)
+    assert [run.state for run in runs if run.path.name == "whole"] == ["complete"]
+
+
+def test_what_the_environment_holds_does_not_get_into_a_report(write_run, tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "swordfish")
+    write_run("received", score=0.5, method__title="${oc.env:SECRET}")
+    pages = report(*find_runs([tmp_path]), moment=datetime.now(UTC))
+    assert "swordfish" not in "".join(pages.values())
+
+
+def test_the_command_writes_both_files(varied_runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(varied_runs), "--output", str(tmp_path / "a" / "b")])
+    main()
+    assert capsys.readouterr().out.startswith("16 runs, 12 complete, 1 not evaluated, 1 unfinished, 2 damaged: ")
+    assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == ["report.html", "report.md"]
+
+
+def test_the_command_tells_what_is_wrong_with_its_arguments(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match=r"torchrl-mcp-report: there is no folder .*nowhere"):
+        main()
+
+
+def test_the_command_tells_that_a_folder_holds_no_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(tmp_path)])
+    with pytest.raises(SystemExit, match="holds no run: give run folders"):
+        main()

@@ -1,0 +1,198 @@
+import hashlib
+import io
+import json
+import pickle
+import random
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import NonTensorData, NonTensorStack
+from torch import nn
+
+from torchrl_mcp.training.checkpoint import (
+    find,
+    load,
+    load_parts,
+    run_checkpoint,
+    saved_config,
+)
+
+PREFIX = "components/0000-part-gating"
+
+
+def listing(folder):
+    """Every path below ``folder`` with a hash of what it holds."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size_is_refused_before_it_is_unpacked(
+    saved_run, monkeypatch, make_parts
+):
+    bomb = saved_run / "bomb.torchrl"
+    with zipfile.ZipFile(find(saved_run)) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name))
+        target.writestr("components/more.memmap", bytes(10_000_000))
+    monkeypatch.setattr(zipfile.ZipFile, "open", lambda *arguments, **settings: pytest.fail("it was unpacked"))
+    with pytest.raises(ValueError, match="would unpack to more than its own size"):
+        load_parts(make_parts(), ["gating"], bomb)
+    with pytest.raises(ValueError, match="would unpack to more than its own size"):
+        saved_config(bomb)
+
+
+def truncate(data, share):
+    return data[: int(len(data) * share)]
+
+
+def flip(data, where):
+    position = {"header": 2, "tensor": data.index(b"tensor_00000000.memmap") + 30, "end": len(data) - 3}[where]
+    return data[:position] + bytes([data[position] ^ 0x40]) + data[position + 1 :]
+
+
+def archive(**members):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as zipped:
+        for name, content in members.items():
+            zipped.writestr(name, content)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(lambda data: b"", id="empty"),
+        *(pytest.param(lambda data, s=s: truncate(data, s), id=f"cut to {s}") for s in (0.01, 0.5, 0.99)),
+        pytest.param(lambda data: data[:-1], id="last byte lost"),
+        *(pytest.param(lambda data, w=w: flip(data, w), id=f"bit flipped in {w}") for w in ("header", "tensor", "end")),
+        pytest.param(
+            lambda data: b"PK\x03\x04" + random.Random(0).randbytes(2000), id="noise that begins like an archive"
+        ),
+        pytest.param(lambda data: b"iteration,loss\n1,0.5\n", id="a text"),
+        pytest.param(lambda data: archive(notes=b"hello"), id="another archive"),
+        pytest.param(lambda data: archive(**{"manifest.json": b"[]"}), id="another manifest"),
+        pytest.param(lambda data: archive(**{"manifest.json": b"\xff{"}), id="a manifest that is no text"),
+        pytest.param(lambda data: pickle.dumps({"gating": 1}), id="a pickle"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_refused_by_name_and_nothing_on_disk_changes(
+    saved_run, spoil, make_parts, same_numbers
+):
+    file = find(saved_run)
+    file.write_bytes(spoil(file.read_bytes()))
+    before, parts = listing(saved_run.parent), make_parts(1)
+    with pytest.raises(ValueError, match="checkpoint of the same configuration") as failure:
+        load_parts(parts, list(parts), file)
+    assert str(file) in str(failure.value)
+    assert listing(saved_run.parent) == before
+    assert same_numbers(parts, make_parts(1))
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        pytest.param(lambda make_parts: make_parts(goal_dim=5), "size mismatch", id="other sizes"),
+        pytest.param(
+            lambda make_parts: nn.ModuleDict({"policy": nn.Linear(3, 2)}), "part-policy", id="a part it lacks"
+        ),
+        pytest.param(
+            lambda make_parts: nn.ModuleDict({"gating": nn.Linear(3, 2)}), "Missing key", id="another architecture"
+        ),
+    ],
+)
+def test_a_checkpoint_that_does_not_fit_is_refused_and_nothing_on_disk_changes(saved_run, make, expected, make_parts):
+    before, parts = listing(saved_run.parent), make(make_parts)
+    with pytest.raises(ValueError, match=expected) as failure:
+        load_parts(parts, list(parts), find(saved_run))
+    assert "method, character, task or network size" in str(failure.value)
+    assert listing(saved_run.parent) == before
+
+
+def test_a_missing_component_of_a_run_is_named(saved_run, make_parts):
+    parts = make_parts()
+    with pytest.raises(ValueError, match="progress"):
+        load(run_checkpoint(parts, progress=torch.optim.SGD(parts.parameters())), find(saved_run))
+
+
+def test_a_missing_file_is_refused_and_not_created(saved_run, make_parts):
+    before = listing(saved_run.parent)
+    with pytest.raises(ValueError, match="there is no checkpoint file"):
+        load_parts(make_parts(), ["gating"], saved_run / "checkpoints" / "absent")
+    with pytest.raises(ValueError, match="there is no checkpoint file"):
+        load_parts(make_parts(), ["gating"], saved_run)
+    assert listing(saved_run.parent) == before
+
+
+@pytest.mark.parametrize("content", [b"", b"text", archive(notes=b"hello"), archive(**{"manifest.json": b"[]"})])
+def test_what_is_no_checkpoint_tells_no_configuration(tmp_path, content):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(ValueError, match=r"is not a checkpoint of torchrl-mcp"):
+        saved_config(tmp_path / "file")
+    with pytest.raises(ValueError, match=r"is not a checkpoint of torchrl-mcp"):
+        saved_config(tmp_path / "absent")
+
+
+def test_a_flipped_bit_anywhere_is_refused_or_without_effect(saved_run, make_parts, same_numbers):
+    """The archive has bits that mean nothing here, time stamps for example; none may change a number unnoticed."""
+    file = find(saved_run)
+    data, parts, generator = file.read_bytes(), make_parts(1), random.Random(0)
+    refused = 0
+    for position in range(0, len(data), 41):
+        spoilt = bytearray(data)
+        spoilt[position] ^= 1 << generator.randrange(8)
+        file.write_bytes(spoilt)
+        try:
+            load_parts(parts, list(parts), file)
+        except ValueError:
+            refused += 1
+        else:
+            assert same_numbers(parts, make_parts()), position
+    assert refused > 50
+
+
+class Malice:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+STATE = f"{PREFIX}/state"
+SMUGGLED = {
+    "a field of a tensordict": {
+        f"{STATE}/evil/meta.json": {"_type": str(NonTensorData)},
+        f"{STATE}/evil/other.pickle": None,
+    },
+    "a stack of fields": {
+        f"{STATE}/evil/meta.json": {"_type": str(NonTensorStack), "data": "pickle.pkl", "device": None},
+        f"{STATE}/evil/pickle.pkl": None,
+    },
+    "a torch file": {f"{PREFIX}/state.pt": None},
+}
+
+
+@pytest.mark.parametrize("members", SMUGGLED.values(), ids=SMUGGLED)
+def test_a_pickle_smuggled_into_an_archive_is_not_executed(saved_run, members, make_parts, same_numbers):
+    file, marker = find(saved_run), saved_run / "executed"
+    with zipfile.ZipFile(file) as source:
+        contents = {name: source.read(name) for name in source.namelist()}
+    manifest, meta = json.loads(contents["manifest.json"]), json.loads(contents[f"{STATE}/meta.json"])
+    manifest["components"]["part-gating"]["files"] += [name.removeprefix(f"{PREFIX}/") for name in members]
+    meta["evil"] = {"type": "NonTensorData"}
+    contents |= {"manifest.json": json.dumps(manifest), f"{STATE}/meta.json": json.dumps(meta)}
+    for name, content in members.items():
+        contents[name] = pickle.dumps(Malice(marker)) if content is None else json.dumps(content)
+    file.write_bytes(archive(**contents))
+
+    parts = make_parts(1)
+    with pytest.raises(ValueError, match="neither JSON nor a tensor"):
+        load_parts(parts, list(parts), file)
+    assert not marker.exists()
+    assert same_numbers(parts, make_parts(1))

@@ -1,0 +1,148 @@
+"""Trained policies: restored from a run folder or checkpoint file, evaluated and published."""
+
+import math
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.evaluation.clips import ClipResult, follow_each
+from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.runs import build
+from torchrl_mcp.runs.build import Agent, make_agent, make_env
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
+from torchrl_mcp.training import checkpoint
+
+
+def policy_config(path: Path) -> DictConfig:
+    """Return the configuration with which a policy was trained.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+
+    Raises:
+        ValueError: If there is no checkpoint, or it is damaged or from another version of the library.
+    """
+    file = checkpoint.find(path)
+    config = checkpoint.saved_config(file)
+    build.require_known(config, file)
+    return OmegaConf.create(dict(config))
+
+
+def restore(
+    path: Path, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
+) -> tuple[DictConfig, Agent, CharacterEnv | TransformedCharacterEnv]:
+    """Return configuration, trained agent and new environments from a run folder or checkpoint file.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file. Published files have no critic; it is then
+            untrained.
+        num_envs: Number of environments.
+        seed: Seed of the environments.
+        device: Device of the networks.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
+    """
+    file = checkpoint.find(path)
+    cfg = policy_config(file)
+    cfg.device = device
+    env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
+    agent = make_agent(cfg, env)
+    if checkpoint.shared(file):
+        take_shared(agent.parts, file, builtin(cfg.method.name, cfg.character.name))
+    checkpoint.load_agent(agent.parts, file)
+    return cfg, agent, env
+
+
+def publish_run(path: Path, output: Path) -> None:
+    """Write the policy of a run as a separate checkpoint file, as small as the built-in networks.
+
+    For a run that transferred from a built-in network, the file leaves out the network's frozen parts.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        output: The file to write.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the frozen parts differ from the built-in network.
+    """
+    cfg, agent, _ = restore(path, num_envs=1, seed=0)
+    cfg.run_dir = cfg.run_root = "runs"  # the run's folder is of no use to others
+    parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
+    shared: dict[str, str] = {}
+    if cfg.stage.name == "transfer" and cfg.pretrained == "builtin":
+        shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
+    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output, shared=shared)
+
+
+def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
+    """Return the content of ``evaluation.json``: :func:`evaluate_run` in the environments of the run's configuration.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+
+    Returns:
+        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, ``deterministic`` and
+        ``stochastic``.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
+    environment = settings["environment"]
+    numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
+    return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
+
+
+def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
+    """Return statistics of a run's policy, ``deterministic`` and ``stochastic``.
+
+    Each is the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics` of the episodes, with the
+    :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        episodes: Episodes, one per environment.
+        seed: Seed of environments and sampling.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    results = {}
+    for mode in ("deterministic", "stochastic"):
+        _, agent, env = restore(path, num_envs=episodes, seed=seed, **kwargs)
+        torch.manual_seed(seed)
+        record = diagnosed(agent.actor)
+        outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
+        results[mode] = episode_statistics(outcome, env.normalised_return)
+        results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
+    return results
+
+
+def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
+    """Return results of a run's deterministic policy on each of its reference motions.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        episodes: Number of episodes per clip.
+        seed: Seed of the environments.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+    """
+    _, _, env = restore(path, num_envs=1, seed=seed)
+    if not hasattr(env, "library"):
+        raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
+    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, switch_interval=math.inf)
+    return follow_each(agent.actor.policy, env)
