@@ -1,4 +1,4 @@
-"""Pictures of the characters in their rest pose, from the front, the right and between the two.
+"""Pictures of the characters in their rest pose, from the front, the right, and in between.
 
 MUJOCO_GL=egl python benchmarks/character_pictures.py    # seconds, writes docs/characters/*.png
 """
@@ -33,7 +33,7 @@ def stage(character: str, width: int, height: int) -> mujoco.MjModel:
     plane, sun = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     spec.worldbody.add_geom(name="floor", type=plane, size=[10, 10, 0.1], material="floor")
     spec.worldbody.add_light(name="sun", type=sun, pos=[2, -1.5, 4], dir=[-2, 1.5, -4], diffuse=[0.5] * 3)
-    spec.stat.extent = 5  # of what casts shadows
+    spec.stat.extent = 5  # of the region with shadows
     return spec.compile()
 
 
@@ -47,7 +47,7 @@ def corners(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def picture(character: str, size: int = 480) -> np.ndarray:
-    """Draw the rest pose from the front, the right and between the two, shape ``(size, 3 * size, 3)``."""
+    """Draw the rest pose from the front, the right and in between, shape ``(size, 3 * size, 3)``."""
     model = stage(character, size, size)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -64,7 +64,7 @@ def picture(character: str, size: int = 480) -> np.ndarray:
 
 
 def main() -> None:
-    """Draw the characters that the command line names."""
+    """Draw the characters on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("characters", nargs="*", default=list(CHARACTERS))
     parser.add_argument("--output", type=Path, default=PICTURES, help="folder")

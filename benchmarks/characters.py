@@ -7,19 +7,19 @@
 
 *timestep* compares settings of MuJoCo by accuracy and by speed.
 
-- Accuracy: root mean square difference of all joint angles (rotation vectors of ball joints, in radians) to the same
+- Accuracy: root mean square difference of all joint angles (rotation vectors of ball joints, in radians) from the same
   motion at a time step of 1/3000 s, over one second of control at 30 Hz and 8 seeds. ``smooth`` are sinusoids of
   0.3 rad at 1 to 2 Hz in free space; ``noise`` is normal, 0.1 of half the range of the targets, in free space;
-  ``ground`` are sinusoids of 0.1 rad from standing. A motion that diverges has no number.
-- Speed: control steps per second of processor time, on which other work on the machine has little influence, of 256
-  simulations that stand, stumble and fall by that noise for two seconds. Settings take turns; the mean of two
-  counts.
-- ``pd_only`` is the character without armature and with all its damping in the actuators: at 1/3000 s, what these two
-  change; at longer time steps, what MuJoCo makes of it without them (it prints warnings then).
+  ``ground`` are sinusoids of 0.1 rad from standing. Diverged motions have no number.
+- Speed: control steps per second of processor time, which other work on the machine hardly affects, of 256 simulations
+  that stand, stumble and fall with that noise for two seconds. Settings take turns; the result is the mean of two
+  rounds.
+- ``pd_only`` is the character without armature and with all its damping in the actuators: at 1/3000 s it shows the
+  effect of these two; at longer time steps, MuJoCo's behaviour without them (it prints warnings then).
 
-*stress* draws targets uniformly within their bounds for 10,000 control steps of 256 simulations, a tenth of the steps
-with self-collision. Every 300 steps one half is put back onto its feet and the other 1 m higher with a random
-orientation. ``diverged`` counts what MuJoCo could not continue, ``warnings`` what it complained about; the others are
+*stress* draws targets uniformly within their bounds for 10,000 control steps of 256 simulations, and for a tenth of the
+steps with self-collision. Every 300 steps one half is reset to standing, and the other half 1 m higher with a random
+orientation. ``diverged`` counts simulations that MuJoCo could not continue, ``warnings`` its warnings; the others are
 maxima in J, rad/s and m/s.
 """
 
@@ -49,7 +49,7 @@ PEAKS = ("kinetic_energy", "joint_velocity", "root_velocity")
 
 
 class Setting(NamedTuple):
-    """A choice of MuJoCo's options, and of what the character is given."""
+    """Options of MuJoCo and of the character."""
 
     rate: int
     integrator: str = "implicitfast"
@@ -98,7 +98,7 @@ def scene(character: str, setting: Setting, *, ground: bool = True) -> mujoco.Mj
 
 
 def let_legs_collide(spec: mujoco.MjSpec) -> None:
-    """Let the right leg collide with the left one, and with nothing else of the body."""
+    """Let the right leg collide with the left leg only."""
     for side, contype, conaffinity in (("right", 2, 5), ("left", 4, 3)):
         hip = spec.body(f"{side}_hip")
         for body in (hip, *hip.find_all(mujoco.mjtObj.mjOBJ_BODY)):
@@ -108,7 +108,7 @@ def let_legs_collide(spec: mujoco.MjSpec) -> None:
 
 
 def simulate(model: mujoco.MjModel, num_envs: int, threads: int, *outputs: str) -> BatchSimulation:
-    """Make simulations at 30 control steps per second, at the beginning."""
+    """Make simulations with 30 control steps per second, in the initial state."""
     substeps = round(1 / (CONTROL_RATE * model.opt.timestep))
     simulation = BatchSimulation(
         model, num_envs, substeps=substeps, outputs=outputs, num_threads=threads, persistent=True, current=True
@@ -123,7 +123,7 @@ def half_range(model: mujoco.MjModel) -> Tensor:
 
 
 def sinusoids(model: mujoco.MjModel, amplitude: float) -> Tensor:
-    """Targets that begin at rest and swing at 1 to 2 Hz, shape ``(T, SEEDS, A)``."""
+    """Targets that start at rest and oscillate at 1 to 2 Hz, shape ``(T, SEEDS, A)``."""
     generator = torch.Generator().manual_seed(0)
     frequency, phase = torch.rand(2, SEEDS, model.nu, generator=generator, dtype=torch.float64)
     frequency, phase = 2 * torch.pi * (1 + frequency), 2 * torch.pi * phase
@@ -132,7 +132,7 @@ def sinusoids(model: mujoco.MjModel, amplitude: float) -> Tensor:
 
 
 def noise(model: mujoco.MjModel, steps: int, num_envs: int) -> Tensor:
-    """Targets as exploration draws them about the rest pose, shape ``(T, N, A)``."""
+    """Targets of exploration around the rest pose, shape ``(T, N, A)``."""
     generator = torch.Generator().manual_seed(0)
     return 0.1 * half_range(model) * torch.randn(steps, num_envs, model.nu, generator=generator, dtype=torch.float64)
 
@@ -142,12 +142,12 @@ MOTIONS: dict[str, tuple[bool, Callable[[mujoco.MjModel], Tensor]]] = {
     "noise": (False, lambda model: noise(model, CONTROL_RATE, SEEDS)),
     "ground": (True, lambda model: sinusoids(model, 0.1)),
 }
-"""Whether there is ground, and the targets."""
+"""Motions by name: whether there is ground, and the targets."""
 
 
 @cache
 def play(character: str, setting: Setting, motion: str, threads: int) -> Tensor:
-    """Joint angles after each control step, shape ``(T, SEEDS, A)``, or NaN if one diverged."""
+    """Joint angles after each control step, shape ``(T, SEEDS, A)``, or NaN if a simulation diverged."""
     ground, targets = MOTIONS[motion]
     simulation = simulate(model := scene(character, setting, ground=ground), SEEDS, threads, "actuator_length")
     angles = []
@@ -159,7 +159,7 @@ def play(character: str, setting: Setting, motion: str, threads: int) -> Tensor:
 
 
 def accuracy(character: str, setting: Setting, threads: int) -> dict[str, str]:
-    """Root mean square error of each motion, in radians; empty if it diverged."""
+    """Root mean square error of each motion in radians; empty for diverged motions."""
     reference = Setting(REFERENCE_RATE, self_collision=setting.self_collision)
     errors = {
         motion: play(character, setting, motion, threads) - play(character, reference, motion, threads)
@@ -180,7 +180,7 @@ def speed(character: str, setting: Setting, num_envs: int, threads: int) -> floa
 
 
 def compare(character: str, settings: list[Setting], rounds: int, num_envs: int, threads: int) -> list[dict[str, Any]]:
-    """Return a row per setting: its errors and its speed."""
+    """Return a row per setting, with errors and speed."""
     rows = [accuracy(character, setting, threads) for setting in settings]
     timed = [setting for setting in settings if setting.rate < 990 and not setting.pd_only]
     speeds: dict[Setting, list[float]] = {setting: [] for setting in timed}
@@ -201,7 +201,7 @@ def random_rotations(num: int, generator: torch.Generator) -> Tensor:
 
 
 def stress(character: str, self_collision: str, steps: int, num_envs: int, threads: int) -> list[dict[str, Any]]:
-    """Return the rows of a character under random actions, one for each way to start."""
+    """Return the rows of a character under random actions, one per kind of initial state."""
     model = scene(character, Setting(120, self_collision=self_collision))
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     simulation, generator = simulate(model, num_envs, threads, "energy"), torch.Generator().manual_seed(0)
@@ -241,7 +241,7 @@ def stress(character: str, self_collision: str, steps: int, num_envs: int, threa
 
 
 def logged_warnings() -> int:
-    """Count the warnings in MuJoCo's log, which it writes to the working directory."""
+    """Count the warnings in MuJoCo's log in the working directory."""
     log = Path("MUJOCO_LOG.TXT")
     return log.read_text().count("WARNING") if log.exists() else 0
 
@@ -254,7 +254,7 @@ def timestep(args: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
 
 
 def strain(args: argparse.Namespace) -> Iterator[list[dict[str, Any]]]:
-    """Stress every character, and with self-collision for a tenth of the steps."""
+    """Stress every character without self-collision, and for a tenth of the steps with it."""
     steps, num_envs = (60, 16) if args.quick else (10_000, 256)
     for character in args.characters:
         yield stress(character, "none", steps, num_envs, args.threads)

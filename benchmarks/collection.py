@@ -1,11 +1,11 @@
-"""Collection in workers: does a run learn the same, and how fast is it?
+"""Collection in workers: returns and speed, compared with one process.
 
     python benchmarks/collection.py            # ten minutes, writes results/collection.csv
-    python benchmarks/collection.py --quick    # shows that it runs, writes nothing unless given --output
+    python benchmarks/collection.py --quick    # tests that it runs, writes nothing unless given --output
 
-An ant learns to run in held-out directions from scratch with ``preset=fast``, on as many cores: in one process with a
+An ant learns to run in held-out directions from scratch with ``preset=fast``, on the same cores: in one process with a
 thread per core, and with a worker per core in processes and in Ray. A speed is the median over iterations; a return is
-the mean of the last quarter of them, over seeds.
+the mean over the last quarter of the iterations and over seeds.
 """
 
 import argparse
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def train(collector: str, seed: int, steps: int) -> tuple[float, float]:
-    """Return steps per second and the normalised return that a run came to, in processes of its own."""
+    """Train in separate processes; return steps per second and the final normalised return."""
     with TemporaryDirectory() as folder:
         settings = [*COMMON, *QUIET, *COLLECTORS[collector], f"collector={collector}", f"seed={seed}"]
         arguments = [*settings, f"training.total_frames={steps}", f"run_dir={folder}/run"]

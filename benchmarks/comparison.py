@@ -1,12 +1,12 @@
-"""The methods on a task at equal budgets: what came of the runs of a benchmark, as a table and learning curves.
+"""The methods on a task at equal budgets: results of a benchmark's runs as a table and learning curves.
 
     torchrl-mcp-train benchmark=table2 task=heading character=biped preset=comparison benchmark.pretrain_seed=0 seed=0,1
     python benchmarks/comparison.py runs --task heading --character biped
     python benchmarks/comparison.py runs --task imitation --character biped --stage pretrain
 
-It writes a row for every complete run and mode to ``results/TASK_CHARACTER_methods.csv``, with what it takes to make it
-again, and beside it the curves of those pre-trained for as long as most. A page with more is written by
-``torchrl-mcp-report runs``.
+It writes a row for every complete run and mode to ``results/TASK_CHARACTER_methods.csv``, with everything needed to
+reproduce the run, and beside it the learning curves of runs with the most common number of pre-training steps.
+``torchrl-mcp-report runs`` writes a page with more results.
 """
 
 import argparse
@@ -26,7 +26,7 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def main() -> None:
-    """Read the runs and write what came of them."""
+    """Read the runs and write their results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("runs", type=Path, help="the benchmark's run_root")
     parser.add_argument("--task", default="heading")
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def row(cell: Cell, name: str, run: Run, mode: str, steps: dict[Path, int]) -> dict[str, Any]:
-    """Return the facts of a run and its numbers in a mode."""
+    """Return the facts about a run and its results in a mode."""
     numbers, before = run.evaluation[mode], run.settings.get("pretrained")
     machine, command = run.provenance.get("machine", {}), run.provenance.get("command", [])
     return {
@@ -102,7 +102,7 @@ def line(cell: Cell, name: str) -> dict[str, Any]:
 
 
 def title(cell: Cell, usual: int | None) -> str:
-    """Return the name of a method, and what it transfers from if that is not the usual pre-training."""
+    """Return the name of a method, with its pre-training if that is not the most common one."""
     if cell.choices["pretrained"]:
         return f"{cell.title}, built in"
     steps = budget(cell)
@@ -110,12 +110,12 @@ def title(cell: Cell, usual: int | None) -> str:
 
 
 def budget(cell: Cell) -> int | None:
-    """Return for how many steps the methods are pre-trained, if the preset says so."""
+    """Return the steps of pre-training, if the preset has them."""
     return cell.complete[0].settings.get("budget.pretrain")
 
 
 def paper(cell: Cell) -> str:
-    """Return the paper's figure, if it has one."""
+    """Return the paper's result, if it has one."""
     return f"{cell.reported.mean:.3f} +- {cell.reported.std:.3f}" if cell.reported else ""
 
 

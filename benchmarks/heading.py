@@ -1,12 +1,12 @@
 """The heading task learned from scratch: learning curves, returns beside the paper's, and films.
 
-    python benchmarks/heading.py                      # trains what is missing: an hour or two per character on a core
+    python benchmarks/heading.py                      # trains missing runs: an hour or two per character on a core
     python benchmarks/heading.py --report             # trains nothing
 
-Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for as many steps as
-``CHARACTERS`` says. Run folders are in ``--output``; a run that was stopped goes on. The report plays one episode of
-20 s in each of ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and
-``.svg``, and a film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa where there is no display).
+Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for the steps in
+``CHARACTERS``. Run folders are in ``--output``; stopped runs are resumed. The report plays one episode of 20 s in each
+of ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
+film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa without a display).
 """
 
 import argparse
@@ -21,7 +21,7 @@ from report import about, table, write
 
 from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 from torchrl_mcp.training.run_folder import CONFIG
 from torchrl_mcp.viewer.film import save_film
 
@@ -33,7 +33,7 @@ EVALUATION_SEED = 12345
 
 
 def main() -> None:
-    """Train what is missing, evaluate, and write the results."""
+    """Train missing runs, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--output", type=Path, default=Path("runs/heading"), help="folder of the run folders")
     parser.add_argument("--characters", nargs="+", default=list(CHARACTERS), choices=CHARACTERS)
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def train(run: Path, character: str) -> None:
-    """Train a character in a process of its own, or go on where a former one stopped."""
+    """Train a character in a separate process, or resume its run."""
     settings = [
         f"character={character}",
         "character.action_std=0.15",
@@ -63,31 +63,31 @@ def train(run: Path, character: str) -> None:
 
 
 def has_ended(run: Path, steps: int) -> bool:
-    """Tell whether a run has taken all its steps."""
+    """Return whether a run has taken all its steps."""
     rows = read_metrics(run)
     return bool(rows) and rows[-1]["frames"] >= steps
 
 
 def report(runs: dict[str, Path], episodes: int) -> None:
-    """Write table, curves and films of runs that have ended to ``benchmarks/results``."""
+    """Write table, curves and films of finished runs to ``benchmarks/results``."""
     rows = [row for character, run in runs.items() for row in evaluate(character, run, episodes)]
     write(RESULTS / "heading.csv", rows)
     curves = learning_curves({character: [run] for character, run in runs.items()})
     write_curves(curves, RESULTS / "heading_curves.csv")
     save_figure(draw_curves(curves), RESULTS / "heading_curves")
     for character, run in runs.items():
-        _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+        _, agent, env = policies.restore(run, num_envs=1, seed=EVALUATION_SEED)
         save_film(agent.actor.policy, env, RESULTS / f"heading_{character}.gif")
     shown = ("character", "mode", "normalised_return", "normalised_return_std", "terminated", "paper")
     print(table([{key: row[key] for key in shown} for row in rows]))
 
 
 def evaluate(character: str, run: Path, episodes: int) -> Iterator[dict]:
-    """Yield the numbers of a run, deterministic and stochastic."""
+    """Yield the results of a run, deterministic and stochastic."""
     last = read_metrics(run)[-1]
     facts = {"character": character, "method": "scratch", "seed": 0, "preset": "fast", "paper": PAPER[character]}
     cost = {"frames": int(last["frames"]), "training_seconds": round(last["seconds"])}
-    for mode, numbers in experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
+    for mode, numbers in policies.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED).items():
         del numbers["metrics"], numbers["diagnostics"]
         yield facts | cost | {"mode": mode} | numbers | about()
 

@@ -1,10 +1,10 @@
 """The ant holdout experiment: Figure 5 and the last row of Tables 1 and 2.
 
-    python benchmarks/holdout.py --output runs/holdout    # hours; goes on where it was interrupted
+    python benchmarks/holdout.py --output runs/holdout    # hours; resumes after an interruption
 
 MCP is pre-trained on directions in [0, 3/2 pi] and transferred to [3/2 pi, 2 pi], exploring over actions and over
-weights; so are the additive mixer and the baselines; scratch learns the held-out directions alone, for as many steps as
-pre-training and transfer take together. Every run is one of ``torchrl-mcp-train``, on one core.
+weights, and so are the additive mixer and the baselines. Scratch learns the held-out directions alone, for as many
+steps as pre-training and transfer together. Every run is a call of ``torchrl-mcp-train``, on one core.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, wri
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories, play_directions
 from torchrl_mcp.report.results import Run, read_run
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import CONFIG
 
@@ -39,11 +39,11 @@ class Contender:
     """A line of the table.
 
     Attributes:
-        label: What it is called there.
+        label: Name in the table.
         pretraining: One of ``PRETRAININGS``, or None.
-        settings: Of its transfer, beside those of its pre-training.
-        steps: Of its transfer.
-        paper: The paper's figure.
+        settings: Settings of the transfer, in addition to those of the pre-training.
+        steps: Steps of the transfer.
+        paper: The paper's result.
     """
 
     label: str
@@ -83,7 +83,7 @@ PANELS = {
 
 
 def main() -> None:
-    """Train what is missing, evaluate, and write the results."""
+    """Train missing runs, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--output", type=Path, default=Path("runs/holdout"), help="folder of the run folders")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
@@ -103,13 +103,13 @@ def main() -> None:
 
 
 def pretrain(folder: Path, name: str, seed: int) -> None:
-    """Pre-train a method or mixer, or finish it."""
+    """Pre-train a method or mixer, or finish its run."""
     settings = ["stage=pretrain", *PRETRAININGS[name], f"training.total_frames={PRETRAINING}"]
     train(folder / f"pretrain-{name}-{seed}", [*settings, f"seed={seed}"])
 
 
 def learn(folder: Path, name: str, seed: int) -> None:
-    """Train a contender on the held-out directions, or finish it."""
+    """Train a contender on the held-out directions, or finish its run."""
     contender = CONTENDERS[name]
     settings = ["stage=transfer", *contender.settings, f"training.total_frames={contender.steps}"]
     if contender.pretraining:
@@ -119,14 +119,14 @@ def learn(folder: Path, name: str, seed: int) -> None:
 
 
 def train(run: Path, settings: list[str]) -> None:
-    """Train in a process of its own, or go on where a former one stopped."""
+    """Train in a separate process, or resume the run."""
     arguments = [f"resume={run}"] if (run / CONFIG).exists() else [*COMMON, *settings, f"run_dir={run}"]
     command = [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments]
     subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
 def report(folder: Path, seeds: list[int], episodes: int) -> None:
-    """Evaluate every run that has ended and write table, curves and figures to ``benchmarks/results``."""
+    """Evaluate all finished runs, and write table, curves and figures to ``benchmarks/results``."""
     ended = {name: [s for s in seeds if has_ended(folder / f"{name}-{s}", c.steps)] for name, c in CONTENDERS.items()}
     rows = [row for name in CONTENDERS for seed in ended[name] for row in evaluate(folder, name, seed, episodes)]
     write(RESULTS / "holdout.csv", rows)
@@ -140,26 +140,26 @@ def report(folder: Path, seeds: list[int], episodes: int) -> None:
 
 
 def has_ended(run: Path, steps: int) -> bool:
-    """Tell whether a run has taken all its steps."""
+    """Return whether a run has taken all its steps."""
     rows = read_metrics(run)
     return bool(rows) and rows[-1]["frames"] >= steps
 
 
 def trajectories(run: Path, stage: str) -> Trajectories:
-    """Return where a run's policy goes when told the directions of ``stage``."""
+    """Return trajectories of a run's policy for the target directions of ``stage``."""
     low, high = DIRECTIONS[stage]
     directions = torch.linspace(low, high, round((high - low) / SPACING) + 1, dtype=torch.float64)
-    _, agent, env = experiment.restore(run, num_envs=len(directions), seed=12345)
+    _, agent, env = policies.restore(run, num_envs=len(directions), seed=12345)
     return play_directions(agent.actor.policy, env, directions)
 
 
 def evaluate(folder: Path, name: str, seed: int, episodes: int) -> list[dict]:
-    """Return the numbers of a run, deterministic and stochastic, with what it takes to make it again."""
+    """Return the results of a run, deterministic and stochastic, with everything needed to reproduce it."""
     contender, path = CONTENDERS[name], folder / f"{name}-{seed}"
     run = read_run(path)
     if not isinstance(run, Run):
         raise ValueError(f"{path} {run.reason}")
-    numbers = experiment.evaluate_run(path, episodes=episodes, seed=12345)
+    numbers = policies.evaluate_run(path, episodes=episodes, seed=12345)
     for values in numbers.values():
         del values["metrics"], values["diagnostics"]
     facts = {
@@ -194,7 +194,7 @@ def table(rows: list[dict]) -> str:
 
 
 def spread(values: list[float]) -> str:
-    """Return mean and standard deviation, as far as there are values."""
+    """Return mean and standard deviation, if there are enough values."""
     deviation = f" +- {statistics.stdev(values):.3f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):.3f}{deviation}" if values else ""
 

@@ -1,11 +1,11 @@
-"""What the return of a task can reach: of standing still, and of an ideal player.
+"""Bounds on the return of each task: of standing still, and of an ideal player.
 
     python benchmarks/ideal.py    # a minute, writes results/ideal.csv
 
-The ideal player has no body: object and character move at the task's speed, straight to where they are to be, and wait
-there (:mod:`torchrl_mcp.envs.ideal`). Returns are normalised means over 1,000 episodes drawn as the evaluation draws
-them. Of holdout, whose reward has no ceiling, the second is what Gymnasium calls solved. ``--quick`` takes seconds,
-draws 20 and writes nothing unless given ``--output``.
+The ideal player has no body: object and character move straight to their targets at the task's speed, and wait there
+(:mod:`torchrl_mcp.envs.ideal`). Returns are normalised means over 1,000 episodes, drawn as in the evaluation. The
+reward of holdout has no upper bound; its ideal is Gymnasium's threshold for solved. ``--quick`` takes seconds, draws 20
+episodes and writes nothing unless given ``--output``.
 """
 
 import argparse
@@ -32,11 +32,11 @@ VARIANTS: list[tuple[str, str, dict[str, Any]]] = [
     ("dribble", "trex", {}),
     ("holdout", "ant", {}),
 ]
-"""Tasks as they are evaluated, and with another reward or length."""
+"""Tasks as evaluated, and variants with another reward or length."""
 
 
 def rows(episodes: int) -> Iterator[dict[str, Any]]:
-    """Draw episodes of each and give what they can reach."""
+    """Draw episodes of each variant, and yield their bounds."""
     for task, character, changes in VARIANTS:
         with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
             stage = "pretrain" if task == "holdout" else "transfer"

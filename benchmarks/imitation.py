@@ -1,9 +1,9 @@
-"""Pre-training by imitation: how well do the primitives of MCP learn to follow reference motions?
+"""Pre-training by imitation: how well MCP's primitives follow reference motions.
 
 Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, in the
-``PHASES`` given for it: until so many steps, with these settings of the task. Run again, the script goes on where it
-stopped. It writes learning curves, returns with changing references, the tracking of every clip and films to
-``benchmarks/results``, and with ``--publish`` the networks that come with the library to ``torchrl_mcp/networks``.
+character's ``PHASES``: the last step and settings of the task of each. Called again, the script resumes. It writes
+learning curves, returns with changing references, the tracking of every clip and films to ``benchmarks/results``, and
+with ``--publish`` the built-in networks to ``torchrl_mcp/networks``.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from report import about, write
 
 from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, write_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import FOLDER
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.run_folder import CONFIG, replacing
@@ -50,11 +50,11 @@ COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
 EVALUATION_SEED = 12345
 CHANGES = {"to one of 16 moments": 16, "to any moment": 1}
-"""How many random moments of clips the most similar is taken of, when the reference changes."""
+"""Number of random moments of which the most similar becomes the reference, when it changes."""
 
 
 def main() -> None:
-    """Train what is missing, evaluate, and write the results."""
+    """Train missing runs, evaluate, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--output", type=Path, default=Path("runs/imitation"), help="folder of the run folders")
     parser.add_argument("--characters", nargs="+", default=list(PHASES), choices=PHASES)
@@ -71,11 +71,11 @@ def main() -> None:
     report(runs, arguments.episodes, arguments.episodes_per_clip)
     if arguments.publish:
         for character, run in runs.items():
-            experiment.publish_run(run, FOLDER / f"mcp-{character}.torchrl")
+            policies.publish_run(run, FOLDER / f"mcp-{character}.torchrl")
 
 
 def train(run: Path, character: str) -> None:
-    """Train a character in a process of its own, or go on where a former one stopped."""
+    """Train a character in a separate process, or resume its run."""
     for steps, settings in PHASES[character]:
         if (run / CONFIG).exists():
             set_phase(run, steps, settings)
@@ -89,7 +89,7 @@ def train(run: Path, character: str) -> None:
 
 
 def set_phase(run: Path, steps: int, settings: Mapping[str, float]) -> None:
-    """Let the run in a folder go on until so many steps, with other settings of its task."""
+    """Set the last step and the task's settings of a run's next phase."""
     cfg = OmegaConf.load(run / CONFIG)
     cfg.training.total_frames = steps
     cfg.imitation.update(settings)
@@ -108,7 +108,7 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
                 case = {"character": character, "changes": changes, "mode": mode}
                 rows.append(case | facts[character] | numbers | about())
                 print(*case.values(), f"{numbers['completed']:.0%}, {numbers['tracking_error']:.3f} m", flush=True)
-        followed = experiment.evaluate_clips(run, episodes=episodes_per_clip, seed=EVALUATION_SEED)
+        followed = policies.evaluate_clips(run, episodes=episodes_per_clip, seed=EVALUATION_SEED)
         clips += [{"character": character, **asdict(clip)} for clip in followed]
     write(RESULTS / "imitation.csv", rows)
     write(RESULTS / "imitation_clips.csv", clips)
@@ -116,15 +116,15 @@ def report(runs: dict[str, Path], episodes: int, episodes_per_clip: int) -> None
     write_curves(curves, RESULTS / "imitation_curves.csv")
     save_figure(draw_curves(curves, ylabel="control steps per episode"), RESULTS / "imitation_curves")
     for character, run in runs.items():
-        _, agent, env = experiment.restore(run, num_envs=1, seed=EVALUATION_SEED)
+        _, agent, env = policies.restore(run, num_envs=1, seed=EVALUATION_SEED)
         save_film(agent.actor.policy, env, RESULTS / f"imitation_{character}.gif")
 
 
 def evaluate(run: Path, episodes: int, candidates: int) -> dict[str, dict[str, float]]:
-    """Return the numbers of a run, deterministic and stochastic, while references change."""
-    # Every episode shall last 10 s, so that completing one means the same everywhere.
+    """Return the results of a run, deterministic and stochastic, with changing references."""
+    # Every episode lasts 10 s, so that completion means the same everywhere.
     changing = {"clip_end": "switch", "switch_interval": 5.0, "switch_candidates": candidates}
-    evaluation = experiment.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **changing)
+    evaluation = policies.evaluate_run(run, episodes=episodes, seed=EVALUATION_SEED, **changing)
     for numbers in evaluation.values():
         numbers["completed"] = 1 - numbers.pop("terminated")
         numbers["tracking_error"] = numbers.pop("metrics")["tracking_error"]
@@ -133,7 +133,7 @@ def evaluate(run: Path, episodes: int, candidates: int) -> dict[str, dict[str, f
 
 
 def cost(run: Path) -> dict[str, float]:
-    """Steps and seconds of training behind the newest checkpoint."""
+    """Steps and seconds of training up to the newest checkpoint."""
     frames = int(checkpoint.find(run).stem.partition("-")[2])
     seconds = next(row["seconds"] for row in read_metrics(run) if row["frames"] == frames)
     return {"frames": frames, "training_seconds": round(seconds), "steps_per_second": round(frames / seconds)}

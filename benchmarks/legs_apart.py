@@ -1,12 +1,11 @@
-"""How deep do the legs go into each other?
+"""The depth to which the characters' legs pass into each other.
 
     python benchmarks/legs_apart.py    # a few minutes, writes results/legs_apart.csv
 
-Characters do not collide with themselves, so nothing keeps their legs apart but the motions that they imitate. For
-every character: the signed distance between the legs' collision shapes (``mj_geomDistance``), over the generated
-corpus, and over episodes in which the networks that come with the library follow it, as they are evaluated.
-``deepest_mm`` is the greatest depth in millimetres, the others are shares of the frames in which the legs are in each
-other, and deeper than 1 and 2 cm.
+Characters do not collide with themselves, so only the imitated motions keep their legs apart. This script measures, for
+every character, the signed distance between the legs' collision shapes (``mj_geomDistance``), over the generated corpus
+and over evaluation episodes in which the built-in networks follow it. ``deepest_mm`` is the greatest depth in
+millimetres; the others are shares of the frames with an overlap, and with one deeper than 1 and 2 cm.
 
 ``--quick`` takes seconds, measures less and writes nothing unless given ``--output``.
 """
@@ -25,7 +24,7 @@ from torchrl_mcp.envs import Imitation
 from torchrl_mcp.envs.motions import trex_corpus, walking_corpus
 from torchrl_mcp.envs.motions.inspection.crossing import legs_apart
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.experiment import restore
+from torchrl_mcp.runs.policies import restore
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SEED = 12345
@@ -39,7 +38,7 @@ def generated(character: str) -> Tensor:
 
 
 def learnt(character: str, episodes: int, steps: int) -> Tensor:
-    """Return the states of the built-in network, deterministic, while references change, shape ``(T, nq)``."""
+    """Return states of the deterministic built-in network with changing references, shape ``(T, nq)``."""
     _, agent, env = restore(
         builtin("mcp", character), num_envs=episodes, seed=SEED, clip_end="switch", switch_interval=5.0
     )

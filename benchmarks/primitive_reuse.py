@@ -3,11 +3,11 @@
     python benchmarks/primitive_reuse.py            # minutes, writes results/primitive_reuse.csv
     python benchmarks/primitive_reuse.py --quick    # seconds, writes nothing unless given --output
 
-The library stores what frozen primitives gave when a step was collected, where acting needs them anyway, and its loss
-evaluates the gate alone (*reuse*). *No reuse* is the same without that: the loss evaluates the primitives again, whose
-parameters require no gradient. Both take one and the same batch of random states through the trainer's whole update
-(``num_epochs`` passes of gradient steps on gate and critic), in turns. Sizes are those of the ant (S=27, G=2, A=8) and
-of a humanoid (S=196, G=13, A=28), with the networks and K=8 primitives of method=mcp and the batch of preset=fast.
+The library stores the outputs of frozen primitives when a step is collected, because acting needs them anyway, and its
+loss evaluates the gate alone (*reuse*). With *no reuse*, the loss evaluates the primitives again, without gradients for
+their parameters. Both run the trainer's whole update (``num_epochs`` passes of gradient steps on gate and critic) on
+the same batch of random states, in turns. The sizes are those of the ant (S=27, G=2, A=8) and of a humanoid (S=196,
+G=13, A=28), with the networks and K=8 primitives of method=mcp and the batch of preset=fast.
 """
 
 import argparse
@@ -47,9 +47,9 @@ CHARACTERS = {"ant": Sizes(27, 2, 8), "humanoid": Sizes(196, 13, 28)}
 
 
 def make_trainer(cfg: DictConfig, sizes: Sizes, folder: Path, *, reuse: bool) -> Trainer:
-    """Return the trainer of an agent of these sizes, the same weights every time."""
+    """Return the trainer of an agent of these sizes, with the same weights in every call."""
     num_envs = cfg.training.num_envs
-    env: Any = SimpleNamespace(  # as much of an environment as sizes need
+    env: Any = SimpleNamespace(  # the attributes of an environment with its sizes
         batch_size=[num_envs],
         observation_spec={"observation": torch.empty(num_envs, sizes.observation), "goal": torch.empty(1, sizes.goal)},
         action_spec=torch.empty(num_envs, sizes.action),
@@ -63,7 +63,7 @@ def make_trainer(cfg: DictConfig, sizes: Sizes, folder: Path, *, reuse: bool) ->
 
 @torch.no_grad()
 def collect(trainer: Trainer, sizes: Sizes) -> TensorDictBase:
-    """Return a batch ``(N, T)`` as source and estimation of advantages leave it, of random states."""
+    """Return a batch ``(N, T)`` of random states, as after collection and estimation of advantages."""
     num_envs = trainer.source.num_envs
     steps = []
     for _ in range(trainer.frames_per_batch // num_envs):
@@ -77,7 +77,7 @@ def collect(trainer: Trainer, sizes: Sizes) -> TensorDictBase:
 
 
 def update(trainer: Trainer, batch: TensorDictBase) -> tuple[float, dict[str, float]]:
-    """Return the milliseconds of an update and the means of what its loss reports."""
+    """Return the milliseconds of an update and the means of its loss's outputs."""
     start = time.perf_counter()
     metrics = trainer._update(batch, warming_up=False)
     return (time.perf_counter() - start) * 1e3, metrics

@@ -1,6 +1,6 @@
-"""What benchmarks report: rows as text and as CSV, and what they were measured on.
+"""Reports of benchmarks: rows as text and as CSV, with a description of the machine.
 
-The library is imported where it is needed, because benchmarks also run contenders in interpreters that lack it.
+The library is imported inside functions, because benchmarks also run contenders in interpreters without it.
 """
 
 import csv
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = ("tensordict", "gymnasium", "numpy", "stable-baselines3")
-"""Their versions are reported beside those of the machine's description."""
+"""Packages whose versions are reported in addition to the machine's description."""
 
 
 def about() -> dict[str, Any]:
-    """Return commit, date, the description of the machine, and the versions of what is installed."""
+    """Return commit, date, description of the machine, and versions of installed packages."""
     from torchrl_mcp.runs.machine import machine
     from torchrl_mcp.runs.provenance import commit
 
@@ -28,14 +28,14 @@ def about() -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows of one set of keys as text, a line each."""
+    """Return rows with the same keys as text, a line each."""
     from torchrl_mcp.runs.tables import text_table
 
     return text_table(rows)
 
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write rows of one set of keys as CSV."""
+    """Write rows with the same keys as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))

@@ -2,17 +2,17 @@
 
     python benchmarks/scaling.py            # minutes, writes results/scaling*.csv
     python benchmarks/scaling.py --quick    # a minute, writes nothing unless given --output
-    python benchmarks/scaling.py --refit    # seconds, from the measurements that are there
+    python benchmarks/scaling.py --refit    # seconds, from existing measurements
 
-Measured are whole iterations of MCP on the humanoid's heading task with the primitives that come with the library, in
-the precision that ``autocast=auto`` takes. From the seconds of their sections the model's constants are fitted:
+It measures whole iterations of MCP on the humanoid's heading task with the built-in primitives, in the precision that
+``autocast=auto`` chooses. From the seconds of their sections it fits the constants of a model:
 
     iteration = T * (physics * N / speed-up + forward + forward' * N + rest + rest' * N) + update * N * T / speed-up
 
-with ``N`` environments and ``T`` steps of each. Forward pass and rest keep to one thread. How far more cores speed up
-the others is predicted twice from what the second thread brought here: by Amdahl's law (low), and as if every further
-core brought as much (high). A GPU takes over forward pass and update: its time is that of starting its operations,
-which are counted here, or of their arithmetic, whichever is longer, plus the transfers. ``GPU`` is what is assumed.
+with ``N`` environments and ``T`` steps of each. Forward pass and rest use one thread. The speed-up of the others on
+more cores is predicted from the gain of a second thread in two ways: by Amdahl's law (low), and with the same gain for
+every further core (high). A GPU runs forward pass and update: it takes the time to launch the operations, which are
+counted here, or the time of their arithmetic if longer, plus the transfers. ``GPU`` has the assumptions.
 """
 
 import argparse
@@ -35,10 +35,10 @@ from torchrl_mcp.training.trainer import Trainer
 RESULTS = Path(__file__).resolve().parent / "results" / "scaling.csv"
 SIZES, QUICK_SIZES = (64, 256, 1024, 4096), (16, 64)
 STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 2, 512
-"""Control steps and iterations of a measurement, the first to warm up; passes over its samples, in minibatches."""
+"""Control steps and iterations of a measurement, the first one for warm-up; passes over its samples, minibatch."""
 SECTIONS = ("physics", "forward", "collection", "update", "other")
 GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
-"""Assumed: starts of operations from Python, arithmetic in practice, and a small transfer. The last is waited for."""
+"""Assumptions: launches of operations from Python, sustained arithmetic, and a small transfer with synchronisation."""
 MEASURED = ("num_envs", "threads", "workers", "samples_per_second", *(f"{name}_seconds" for name in SECTIONS))
 TRANSFERS = 5
 """Transfers of a control step, as tests/accelerator counts them for this task."""
@@ -47,18 +47,18 @@ MACHINES = {"2 cores": (2, False), "8 cores": (8, False), "64 cores": (64, False
 
 
 class Operations(TorchDispatchMode):
-    """Counts operations, each of which a GPU would have to be told to start."""
+    """Counts operations, each of which would be launched on a GPU."""
 
     count = 0
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        """Count, and do it."""
+        """Count an operation and run it."""
         self.count += 1
         return operation(*args, **(kwargs or {}))
 
 
 def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
-    """Return the trainer of some iterations, with threads of physics and torch, or workers of a thread each."""
+    """Return the trainer of a measurement, with threads for physics and torch, or workers with one thread each."""
     collector = f"collector={'processes' if workers else 'local'}"
     settings = {
         "character": "humanoid",
@@ -86,18 +86,18 @@ def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
 
 
 class Record:
-    """Takes the place of files: keeps metrics in memory, and writes no checkpoint."""
+    """A metrics writer that keeps metrics in memory."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
 
     def write(self, metrics: dict[str, float], *, step: int) -> None:
-        """Keep a row."""
+        """Store a row."""
         self.rows.append(metrics)
 
 
 def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
-    """Return samples per second and the seconds of an iteration's sections, the first left out."""
+    """Return samples per second and the seconds of an iteration's sections, without the first iteration."""
     torch.set_num_threads(threads)
     trainer = make_trainer(num_envs, threads, workers)
     record = Record()
@@ -117,7 +117,7 @@ def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
 
 
 def count() -> dict[str, float]:
-    """Return operations and FLOPs of the policy's forward pass and of a gradient step, the latter's per sample."""
+    """Return operations, and FLOPs per sample, of the policy's forward pass and of a gradient step."""
     trainer, counts = make_trainer(MINIBATCH, 1, 0), {}
     batch = trainer.source.env.fake_tensordict().expand(MINIBATCH).clone()
     with torch.no_grad(), Operations() as operations, FlopCounterMode(display=False) as flops:
@@ -132,7 +132,7 @@ def count() -> dict[str, float]:
 
 
 def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the model's constants: seconds per control step and sample on one thread, and the gain of a second."""
+    """Return the model's constants: seconds per control step and sample on one thread, and a second thread's gain."""
     one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
     constants: dict[str, float] = {}
     for name in ("forward", "other"):
@@ -147,7 +147,7 @@ def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def predict(num_envs: int, cores: int, gpu: bool, c: dict[str, float], *, linear: bool) -> int:
-    """Return samples per second of ``cores`` cores, with or without a GPU, by the model's constants."""
+    """Return samples per second on ``cores`` cores, with or without a GPU, from the model's constants."""
 
     def speed_up(name: str) -> float:
         gain = c[f"{name}_gain"]

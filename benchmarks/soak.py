@@ -1,24 +1,25 @@
-"""Faults on purpose: kills and full disks in training, damaged checkpoints, actions that no policy means.
+"""Deliberate faults: kills and full disks in training, damaged checkpoints, and unfit actions.
 
     python benchmarks/soak.py training    # 50 minutes, writes results/soak_training.csv
     python benchmarks/soak.py flips       # a minute, writes results/soak_flips.csv
     python benchmarks/soak.py steps       # half an hour, writes results/soak_steps.csv
 
-``--quick`` does less and writes nothing unless given ``--output``.
+``--quick`` takes fewer steps, and writes a file only with ``--output``.
 
-*training*: runs on a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180; where
-this user may not mount one, files may not grow at those times (``RLIMIT_FSIZE``). The main process alone gets SIGKILL
-after one to three minutes. What has ended is started again until it is done; then another run begins, until the minutes
-are over. ``slowest_end_s``: until the last process of a killed run was gone. ``wrong``: rows not numbered one by one,
-or with a loss that is no number, and steps that the csv logger lacks or has twice. ``changed``: rows before a
-checkpoint that are others after a resume. ``differing``: rows and contents of the last checkpoint that are not, bit for
-bit, those of a run that nobody disturbed (``collector=local``; workers begin new episodes).
+*training*: runs use a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180 seconds.
+If this user may not mount one, files cannot grow at those times (``RLIMIT_FSIZE``). The main process alone gets
+SIGKILL after one to three minutes. A run that has ended is resumed until it is complete; then another run begins, until
+the time is over. ``slowest_end_s``: seconds until the last process of a killed run was gone. ``wrong``: rows with a
+wrong step or a loss that is not finite, and steps that the csv logger lacks or has twice. ``changed``: rows before a
+checkpoint that changed in a resume. ``differing``: rows and contents of the last checkpoint that differ in any bit from
+those of an undisturbed run (for ``collector=local`` only, because workers begin new episodes).
 
-*flips*: one bit of a checkpoint, drawn at random, is inverted. ``harmless``: accepted, with every content as it was.
+*flips*: one random bit of a checkpoint is inverted. ``harmless``: accepted, with unchanged contents.
 
-*steps*: a third of the simulations gets targets drawn uniformly within their bounds, a third also sizes up to 1e12 and
-infinity, and a third also NaN. ``unfit`` actions are not finite or beyond MuJoCo's limit, and must end their episode
-with reward 0; ``missed`` are those that did not. ``diverged``: of all others. ``not_finite``: emitted numbers.
+*steps*: a third of the simulations gets targets drawn uniformly within their bounds, a third also magnitudes up to 1e12
+and infinity, and a third also NaN. ``unfit`` actions are not finite or beyond MuJoCo's limit, and must end their
+episode with reward 0; ``missed`` counts those that did not. ``diverged``: divergences after all other actions.
+``not_finite``: outputs that are not finite.
 """
 
 import argparse
@@ -52,11 +53,11 @@ SETTINGS = (
     *("training.num_envs=16", f"training.frames_per_batch={BATCH}", "training.minibatch_size=128"),
 )
 KILL = (60.0, 180.0)
-"""Seconds after which a run is killed, at least and at most."""
+"""Minimum and maximum seconds after which a run is killed."""
 
 
 def attempt(settings: list[str], disk: Disk, log: Path, patience: float) -> tuple[str, float]:
-    """Run training until it ends or is killed; return how, and the seconds until all its processes were gone."""
+    """Run training until it ends or is killed; return the cause, and the seconds until all its processes were gone."""
     with log.open("wb") as file:
         process = subprocess.Popen([*TRAIN, *settings], stdout=file, stderr=file, start_new_session=True)
     deadline = time.monotonic() + patience
@@ -76,7 +77,7 @@ def attempt(settings: list[str], disk: Disk, log: Path, patience: float) -> tupl
 
 
 def _group(stat: Path) -> int:
-    """Return the process group of a process that lives, or 0."""
+    """Return the process group of a living process, or 0."""
     with suppress(OSError):
         state, _, group = stat.read_text().rpartition(")")[2].split()[:3]
         return 0 if state == "Z" else int(group)
@@ -84,7 +85,7 @@ def _group(stat: Path) -> int:
 
 
 def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: bool) -> dict[str, Any]:
-    """Train, and start again after each end, until the run is done."""
+    """Train, and resume after each interruption, until the run is complete."""
     ends: Counter[str] = Counter()
     slowest, changed, before, began = 0.0, 0, [], time.monotonic()
     while not ends["done"]:
@@ -111,7 +112,7 @@ def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: b
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
-    """Return the whole rows of a run's metrics, without times."""
+    """Return the complete rows of a run's metrics, without times."""
     path = folder / run_folder.METRICS
     if not path.exists():
         return []
@@ -121,7 +122,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def wrong(folder: Path, total: int) -> int:
-    """Count what no run may write."""
+    """Count wrong steps in metrics and log, and losses that are not finite."""
     steps, found = [str(frames) for frames in range(BATCH, total + 1, BATCH)], rows(folder)
     logged = [line.partition(",")[0] for line in (folder / "csv/scalars/reward.csv").read_text().splitlines()]
     lists = ([row["frames"] for row in found], logged)
@@ -131,7 +132,7 @@ def wrong(folder: Path, total: int) -> int:
 
 
 def differing(first: Path, second: Path) -> int:
-    """Count the rows and the contents of the last checkpoint in which two runs differ."""
+    """Count the rows of metrics and the members of the last checkpoint in which two runs differ."""
     states = [contents(checkpoint.find(folder)) for folder in (first, second)]
     names = states[0].keys() | states[1].keys()
     return sum(a != b for a, b in zip_longest(rows(first), rows(second))) + sum(
@@ -162,7 +163,7 @@ def training(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def main() -> None:
-    """Do harm, print and write."""
+    """Run the chosen test, print and write its rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["training", "flips", "steps"])
     parser.add_argument("--minutes", type=float, default=50.0, help="of training (default 50)")
@@ -184,7 +185,7 @@ def main() -> None:
     for row in {"training": training, "flips": flips, "steps": steps}[args.what](args):
         print(table([row]), flush=True)
         measured.append({**row, **conditions})
-        if output:  # what an interruption leaves counts
+        if output:  # after each row, so that an interruption loses nothing
             write(output, measured)
 
 

@@ -1,4 +1,4 @@
-"""A small disk that fills now and then: a part of ``soak.py``."""
+"""A small disk that is full from time to time, for ``soak.py``."""
 
 import random
 import resource
@@ -10,11 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FULL, FREE = (5.0, 15.0), (90.0, 180.0)
-"""Seconds that the disk is full, and that it has room, at least and at most."""
+"""Minimum and maximum seconds for which the disk is full, and for which it has space."""
 
 
 class Disk:
-    """A small disk that fills now and then."""
+    """A small disk that is full from time to time."""
 
     def __init__(self, folder: Path, pace: float) -> None:
         mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)]
@@ -24,7 +24,7 @@ class Disk:
         self._full, self._next = False, time.monotonic() + pace * random.uniform(*FREE)
 
     def pass_time(self, process: "subprocess.Popen[bytes]") -> None:
-        """Fill the disk, or empty it, if it is time."""
+        """Fill or empty the disk, if it is time to."""
         if time.monotonic() < self._next:
             return
         self._full = not self._full
@@ -42,7 +42,7 @@ class Disk:
 
 @contextmanager
 def small_disk(pace: float) -> Iterator[tuple[Path, Disk]]:
-    """Give a folder on a small disk."""
+    """Yield a folder on a small disk, and the disk."""
     with tempfile.TemporaryDirectory() as name:
         disk = Disk(Path(name), pace)
         try:

@@ -1,4 +1,4 @@
-"""Damaged checkpoints, and actions that no policy means: parts of ``soak.py``."""
+"""Damaged checkpoints and unfit actions, for ``soak.py``."""
 
 import argparse
 import math
@@ -18,17 +18,17 @@ from zipfile import ZipFile
 import torch
 
 from torchrl_mcp.envs.simulation import LARGEST
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training import checkpoint
 
 SMALL = ("method=mcp", "task=holdout", "stage=pretrain", "preset=smoke", "width=0.0625", "autocast=false")
-"""Settings of a run that is soon trained and has small checkpoints."""
+"""Settings of a short run with small checkpoints."""
 
 TASKS = [("holdout", "ant"), *product(("imitation", "heading", "carry", "dribble"), ("biped", "humanoid", "trex"))]
 
 
 def contents(path: Path) -> Mapping[str, bytes]:
-    """Return all that a checkpoint holds, but for times and the generators of random numbers."""
+    """Return the members of a checkpoint, except times and random number generators."""
     with ZipFile(path) as archive:
         names = [
             name for name in archive.namelist() if not re.match(r"manifest|components/\d+-(progress|random)", name)
@@ -37,11 +37,11 @@ def contents(path: Path) -> Mapping[str, bytes]:
 
 
 def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Damage a checkpoint and try to read it, as a resume and as an evaluation would."""
+    """Damage a checkpoint, and try to read it for a resume and for an evaluation."""
     with tempfile.TemporaryDirectory() as name:
         cfg = build.compose_run(*SMALL, f"run_dir={name}/run", "logger=none", "progress_bar=false")
         path, copy = checkpoint.find(experiment.train(cfg)), Path(name) / "damaged.torchrl"
-        _, agent, _ = experiment.restore(path, num_envs=1, seed=0)
+        _, agent, _ = policies.restore(path, num_envs=1, seed=0)
         whole = {key: value.clone() for key, value in agent.parts.state_dict().items()}
         original, results = path.read_bytes(), {check: Counter[str]() for check in ("resume", "evaluate")}
         for _ in range(20 if args.quick else args.flips):
@@ -65,12 +65,12 @@ def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def outcome(same: bool) -> str:
-    """Name what was accepted."""
+    """Return the outcome for a damaged file that was accepted."""
     return "harmless" if same else "accepted_wrongly"
 
 
 def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Act as no policy means to, in all tasks with all characters."""
+    """Play unfit actions in all tasks with all characters."""
     os.chdir(tempfile.mkdtemp())  # where MuJoCo writes its warnings
     num_envs, total = (6, 60 * len(TASKS)) if args.quick else (768, args.steps)
     chosen = [(task, character) for task, character in TASKS if task in args.tasks]
@@ -105,7 +105,7 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def actions(low: torch.Tensor, high: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Draw actions: within the bounds, of any size, and with NaN, each for a third of the simulations."""
+    """Draw actions: within the bounds, of any magnitude, and with NaN, each for a third of the simulations."""
     third = len(low) // 3
     drawn = low + (high - low) * torch.rand(low.shape, generator=generator)
     sizes = 10 ** (12 * torch.rand(third, 1, generator=generator))

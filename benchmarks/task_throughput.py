@@ -3,17 +3,17 @@
     python benchmarks/task_throughput.py            # a quarter of an hour, writes results/task_throughput.csv
     python benchmarks/task_throughput.py --quick    # seconds, writes nothing unless given --output
 
-``ours`` goes through TorchRL's ``step_and_maybe_reset``. ``raw`` is ``mujoco.batch`` with the scene's model: it replays
-the same controls from the same states with as many physics steps, kinematics brought up to date as the tasks need them,
-and takes over the states in which ours begins new episodes, so that both compute the same physics. Characters act at
-random; in imitation they act by the policy that comes with the library, exploring as in training, so that episodes last
-as long as there. Its time is left out, for it is not the environment's.
+``ours`` calls TorchRL's ``step_and_maybe_reset``. ``raw`` is ``mujoco.batch`` with the scene's model: it replays the
+same controls from the same states with the same physics steps, updates kinematics as the tasks need them, and copies
+the initial states of new episodes, so that both compute the same physics. Characters act at random; in imitation they
+use the built-in policy, exploring as in training, so that episodes last as long as there. The policy's time is
+excluded.
 
-Both have one torch thread and all processors for physics, and take turns of a few steps each. A speed is that of the
-fastest turn, for whatever else a machine does only slows: ``of_raw`` is the ratio of the two. ``physics`` is the share
-of our time inside MuJoCo in that turn, ``resets`` the mean number of new episodes in a step. ``memory_kib`` is what one
-more simulation takes: resident memory of the process with the largest number of simulations less that without, divided
-by the number. Every pair has a process of its own.
+Both have one torch thread and all processors for physics, and take turns of a few steps each. The fastest turn
+counts, because other work on the machine only slows turns down: ``of_raw`` is the ratio of the two speeds. ``physics``
+is the share of our time inside MuJoCo in that turn, ``resets`` the mean number of new episodes in a step.
+``memory_kib`` is the resident memory per simulation: the process's memory with simulations less its memory without,
+divided by their number. Every pair has its own process.
 """
 
 import argparse
@@ -40,17 +40,17 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp import envs
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.experiment import restore
+from torchrl_mcp.runs.policies import restore
 
 RESULTS = Path(__file__).resolve().parent / "results" / "task_throughput.csv"
 TASKS, SIZES = ("Heading", "Carry", "Dribble", "Imitation"), (256, 1024)
 AIMS = {256: 0.9, 1024: 0.95}
 AIMS_OF_IMITATION = {256: 0.85, 1024: 0.9}
 PARTS = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")
-"""What a simulation's physics begins with, as far as a scene has it."""
+"""Parts of the state of a simulation, if the scene has them."""
 
 Step = tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
-"""Controls ``(N, A)``, the ``n`` simulations that ended and begin anew, and their new states, each ``(n, ...)``."""
+"""Controls ``(N, A)``, the ``n`` simulations with a new episode, and their initial states, each ``(n, ...)``."""
 
 
 def resident() -> float:
@@ -60,7 +60,7 @@ def resident() -> float:
 
 
 def make(task: str, character: str, **kwargs: Any) -> envs.PDCharacterEnv:
-    """Environments of a task; imitation follows the generated corpus with the reward of its configuration."""
+    """Environments of a task; imitation uses the generated corpus and the reward of its configuration."""
     if task != "Imitation":
         return getattr(envs, task)(character=character, **kwargs)
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
@@ -69,18 +69,18 @@ def make(task: str, character: str, **kwargs: Any) -> envs.PDCharacterEnv:
 
 
 class Ours:
-    """A task that is stepped, and what bare MuJoCo needs to do the same.
+    """Steps a task and records the input that bare MuJoCo needs to replay it.
 
     Args:
         env: The task.
-        act: From what it shows to what is shown and the action.
+        act: Function that adds the action to the task's observations.
     """
 
     def __init__(self, env: envs.PDCharacterEnv, act: Callable[[TensorDictBase], TensorDictBase]) -> None:
         self.env, self.act, self.state = env, act, env.reset()
 
     def turn(self, steps: int) -> tuple[float, dict[str, np.ndarray], list[Step]]:
-        """Take steps; give the seconds in the environment, the state before them, and what was done in each."""
+        """Take steps; return the seconds in the environment, the state before the steps, and the record of each."""
         seconds, done = 0.0, []
         physics = {key: value for key, value in self.env.simulation.state.items() if key in PARTS}
         before = {key: value.numpy().copy() for key, value in physics.items()}
@@ -103,7 +103,7 @@ class Raw:
         self.parts = {key: self.batch.bind(key) for key in ("ctrl", *PARTS)}
 
     def turn(self, before: dict[str, np.ndarray], done: list[Step]) -> float:
-        """Do what ours did; give the seconds."""
+        """Replay our steps; return the seconds."""
         for key, value in before.items():
             self.parts[key][:] = value
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -117,7 +117,7 @@ class Raw:
 
 
 def actions(task: str, env: envs.PDCharacterEnv) -> Callable[[TensorDictBase], TensorDictBase]:
-    """How characters act in a task."""
+    """Return the policy of the characters in a task."""
     if task == "Imitation":
         _, agent, _ = restore(builtin("mcp", env.character.name), num_envs=1, seed=0)
         return agent.actor.policy
@@ -165,7 +165,7 @@ def measure(task: str, character: str, num_envs: int, turns: int, steps: int, th
 
 
 def rows(tasks: list[str], characters: list[str], sizes: list[int], *settings: int) -> Iterator[dict[str, Any]]:
-    """Measure each pair and size in a process of its own."""
+    """Measure each pair and size in a separate process."""
     for task in tasks:
         for character in characters:
             for num_envs in sizes:

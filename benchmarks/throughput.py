@@ -3,14 +3,14 @@
     python benchmarks/throughput.py            # about five minutes, writes results/throughput_env.csv
     python benchmarks/throughput.py --quick    # about one
 
-Every contender simulates Ant-v5 (5 physics steps per action, contact observations and costs off but where said), acts
-at random and resets fallen ants. Each has a process of its own. In a turn they measure one after the other, round after
-round, so that a busy machine slows all of them; a speed is the median over rounds, a ratio the median of the rounds'.
-Compare speeds of one turn only.
+Every contender simulates Ant-v5 (5 physics steps per action, without contact observations and costs unless stated),
+acts at random and resets fallen ants. Each has its own process. In a turn they are measured one after the other, round
+after round, so that a busy machine slows all of them; a speed is the median over rounds, a ratio the median of the
+rounds' ratios. Compare only speeds of the same turn.
 
-Environments that take a process each are measured with one process, with one per processor, and Gymnasium's with 64; a
-loop in Python does not get faster with more. EnvPool is measured where it is installed; ``--envpool-python`` names the
-interpreter that has it.
+Environments with a process each are measured with one process, with one per processor, and Gymnasium's with 64; a loop
+in Python does not get faster with more. EnvPool is measured if it is installed; ``--envpool-python`` sets an
+interpreter with EnvPool.
 """
 
 import argparse
@@ -40,12 +40,12 @@ Step = Callable[[int], None]
 
 
 def actions(num_envs: int) -> np.ndarray:
-    """Random actions, 32 of them to go through, shape ``(32, num_envs, 8)``."""
+    """Return 32 random actions to cycle through, shape ``(32, num_envs, 8)``."""
     return np.random.default_rng(0).uniform(-1, 1, (32, num_envs, 8)).astype(np.float32)
 
 
 def raw(num_envs: int) -> Step:
-    """``mujoco.batch`` and the least that random acting and resetting take: the limit."""
+    """``mujoco.batch`` with minimal random actions and resets: the upper limit."""
     import mujoco
     from mujoco.batch import Batch
 
@@ -119,7 +119,7 @@ def torchrl_parallel(num_envs: int) -> Step:
 
 
 def torchrl_ant(num_envs: int, integrator: str = "Euler") -> Step:
-    """TorchRL's AntEnv on C MuJoCo; a process per ant. It comes with Euler, a quarter of the work of Ant-v5's RK4."""
+    """TorchRL's AntEnv on C MuJoCo; a process per ant. Its default is Euler, a quarter of the work of Ant-v5's RK4."""
     from torchrl.envs import AntEnv
 
     class Ant(AntEnv):
@@ -143,7 +143,7 @@ CONTENDERS: dict[str, tuple[Callable[[int], Step], tuple[int, ...]]] = {
     "TorchRL AntEnv": (torchrl_ant, (1, CPUS, CPUS, 1)),
     "TorchRL AntEnv, RK4": (partial(torchrl_ant, integrator="RK4"), (1, CPUS, CPUS, 1)),
 }
-"""How to set a contender up, and its number of environments in each turn."""
+"""Constructor of each contender, and its number of environments in each turn."""
 
 
 def peak_memory(pid: int) -> float:
@@ -159,7 +159,7 @@ def peak_memory(pid: int) -> float:
 
 
 def worker(name: str, num_envs: int) -> None:
-    """Set a contender up, then time it for as many seconds as each line of standard input says."""
+    """Set a contender up, then time it for the seconds in each line of standard input."""
     step, index = CONTENDERS[name][0](num_envs), 0
     until = time.perf_counter() + 0.3  # warm up, and let the first ants fall
     while index < 20 or time.perf_counter() < until:
@@ -215,7 +215,7 @@ def ratio(row: dict[str, Any], other: dict[str, Any]) -> float:
 
 
 def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Compare the speeds of a turn with what was aimed at."""
+    """Compare the speeds of a turn with the aims."""
     for size in sorted({row["turn"] for row in rows if row["turn"] >= 256}):
         turn = {row["contender"]: row for row in rows if row["turn"] == size}
         aimed = {"mujoco.batch": 0.95, "EnvPool": 1, "Gymnasium sync": 2.5, "Gymnasium async": 2.5}
@@ -227,7 +227,7 @@ def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the line of a table for what a contender did."""
+    """Return the line of a contender in the table."""
     return {
         **{key: row[key] for key in ("turn", "contender", "num_envs")},
         "steps_per_second": round(median(row["speeds"])),

@@ -4,17 +4,16 @@
     python benchmarks/training_throughput.py            # minutes, writes results/training_throughput.csv
     python benchmarks/training_throughput.py --quick    # seconds, writes nothing unless given --output
 
-Both train Gymnasium's Ant-v5 without contact forces, and everything that an iteration does counts: acting, physics,
-resets, advantages, gradient steps, metrics. Alike are the policy and value networks (1024-512, ReLU, separate), the
-initial policy's spread, frames per iteration, minibatch and epochs (those of preset=fast), the step size and the number
-of threads. The rest is what each does by default: ours sees a goal, standardises its inputs and takes fused Adam steps.
+Both train Gymnasium's Ant-v5 without contact forces, and the time includes the whole iteration: acting, physics,
+resets, advantages, gradient steps, metrics. Policy and value networks (1024-512, ReLU, separate), initial standard
+deviation, frames per iteration, minibatch and epochs (of preset=fast), step size and number of threads are the same.
+The rest is each library's default: ours has a goal, standardises its inputs and takes fused Adam steps.
 
 A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` measures others than the default.
-With ``--before PYTHON``, an interpreter that has another version of this library, ``before-METHOD-PRECISION`` is that
-version, side by side with this one.
-Each has a process of its own, in which the first iteration is not counted. They then take turns, one iteration each per
-round, while the others wait, so that a busy machine slows all of them. A speed is the median over rounds, a ratio the
-median of the rounds'.
+With ``--before PYTHON``, an interpreter with another version of this library, ``before-METHOD-PRECISION`` is that
+version, for comparison with this one. Each contender has its own process, in which the first iteration is not counted.
+They then take turns, one iteration each per round, while the others wait, so that a busy machine slows all of them. A
+speed is the median over rounds, a ratio the median of the rounds' ratios.
 """
 
 import argparse
@@ -44,7 +43,7 @@ SECTIONS = ("physics", "forward", "update", "other")
 AIM = 2.0
 
 Iteration = dict[str, Any]
-"""What a worker reports: ``seconds``, peak ``memory`` in MiB, and ``shares`` of the seconds by section."""
+"""Report of a worker: ``seconds``, peak ``memory`` in MiB, and ``shares`` of the seconds by section."""
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -57,7 +56,7 @@ class Turns:
     """The worker's side: an iteration begins at a line of standard input and ends with a line of JSON."""
 
     def begin(self) -> None:
-        """Wait for the word; without one, all is measured."""
+        """Wait for a line; at the end of the input, exit."""
         if not sys.stdin.readline():
             raise SystemExit
         self.start = time.perf_counter()
@@ -68,19 +67,19 @@ class Turns:
         print(json.dumps({"seconds": seconds, "memory": peak_memory(os.getpid()), "shares": shares}), flush=True)
 
     def log_metrics(self, metrics: dict[str, float], step: int) -> None:
-        """As a logger of ours, which is called when an iteration is complete."""
+        """End the turn; the trainer calls it as a logger, when an iteration is complete."""
         self.end({section: metrics[f"time/{section}"] for section in SECTIONS})
         self.begin()
 
 
 def ours(method: str, precision: str, training: dict[str, int]) -> None:
-    """Train by the library's own configuration and loop."""
+    """Train with this library's configuration and loop."""
     from torchrl_mcp.runs import build
 
     settings = {
         "method": method,
         "task": "holdout",
-        "task.directions.pretrain": [0, 0],  # +x, where the reward is that of Ant-v5
+        "task.directions.pretrain": [0, 0],  # +x, with the reward of Ant-v5
         "task.pretrain.max_episode_steps": 1000,
         "autocast": precision == "bf16",
         "optimizer.actor.lr": STEP_SIZE,
@@ -102,7 +101,7 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
 
 
 def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
-    """Train by Stable-Baselines3 with its ``DummyVecEnv`` (a loop) or ``SubprocVecEnv`` (a process per ant)."""
+    """Train with Stable-Baselines3 and its ``DummyVecEnv`` (a loop) or ``SubprocVecEnv`` (a process per ant)."""
     from math import log
 
     from stable_baselines3 import PPO
@@ -150,7 +149,7 @@ def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
 
 
 def worker(name: str, training: dict[str, int], threads: int) -> None:
-    """Train as the contender of that name."""
+    """Train as the named contender."""
     import torch
 
     torch.set_num_threads(threads)
@@ -171,7 +170,7 @@ def peak_memory(pid: int) -> float:
 
 
 def iterate(name: str, process: subprocess.Popen) -> Iteration:
-    """Let the contender of that name take one iteration, and return what it reports."""
+    """Let the named contender take one iteration, and return its report."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(BrokenPipeError):
@@ -186,7 +185,7 @@ def iterate(name: str, process: subprocess.Popen) -> Iteration:
 def measure(
     contenders: list[str], training: dict[str, int], threads: int, rounds: int, before: str
 ) -> dict[str, list[Iteration]]:
-    """Return every contender's iterations, one per round; ``before`` is the interpreter of those of that name."""
+    """Return every contender's iterations, one per round; ``before`` is the interpreter for ``before-...`` ones."""
     processes: dict[str, subprocess.Popen] = {}
     pipe, settings = subprocess.PIPE, ["--threads", str(threads), "--worker", json.dumps(training)]
     with TemporaryDirectory() as folder:
@@ -230,7 +229,7 @@ def summaries(iterations: dict[str, list[Iteration]], frames: int) -> list[dict[
 
 
 def available(contenders: list[str]) -> list[str]:
-    """Leave out what is not installed, and say so."""
+    """Leave out contenders that are not installed, with a message."""
     if importlib.util.find_spec("stable_baselines3"):
         return contenders
     for name in contenders:

@@ -1,0 +1,104 @@
+r"""Learning curves of carrying and dribbling for every kind of training episodes (``practice``).
+
+    torchrl-mcp-train --multirun method=mcp task=carry,dribble character=biped stage=transfer pretrained=builtin \
+        practice=printed,beginnings,ranges,shaping,emphasis exploration=correlated_weights gating.network.width=0.5 \
+        critic.width=0.5 optimizer.critic.lr=3e-4 training.total_frames=409_600 checkpoint_interval=50 \
+        keep_checkpoints=9 evaluation.episodes=0 run_root=runs/practice    # four minutes a run on a core
+    python benchmarks/practice.py runs/practice    # half a minute a checkpoint; writes results/practice.csv and figures
+
+Every kept checkpoint of a run plays deterministic episodes of ``task.evaluation``, the same for all runs.
+``practice_TASK.png`` has a line for each practice, with the range over its seeds.
+"""
+
+import argparse
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from report import about, table, write
+
+from torchrl_mcp.analysis import draw_curves
+from torchrl_mcp.analysis.curves import Curve
+from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
+from torchrl_mcp.runs import policies
+from torchrl_mcp.training import run_folder
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def main() -> None:
+    """Evaluate the checkpoints, print and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, help="folder of the run folders")
+    parser.add_argument("--episodes", type=int, default=64, help="of each evaluation (default 64)")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder to write to")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    rows: list[dict[str, Any]] = []
+    for config in sorted(arguments.runs.rglob(run_folder.CONFIG)):
+        for path in reversed(run_folder.find_all(config.parent)):
+            if run_folder.frames(path):
+                rows.append(row(path, arguments.episodes) | about())
+                print(table([{key: rows[-1][key] for key in list(rows[-1])[:10]}]), flush=True)
+    if not rows:
+        parser.error(f"{arguments.runs} holds no run with a checkpoint")
+    rows.sort(key=lambda row: (row["task"], row["practice"], row["exploration"], row["seed"], row["steps"]))
+    write(arguments.output / "practice.csv", rows)
+    for task, of_task in groupby(rows, lambda row: row["task"]):
+        figure = draw_curves(list(curves(list(of_task))), ylabel="normalised return")
+        save_figure(figure, arguments.output / f"practice_{task}")
+
+
+def row(path: Path, episodes: int) -> dict[str, Any]:
+    """Return the results of a checkpoint's policy in the episodes of its evaluation."""
+    cfg = policies.policy_config(path)
+    evaluation: Any = OmegaConf.to_container(cfg.evaluation, resolve=True)
+    seed, settings = evaluation["seed"], evaluation["environment"]
+    _, agent, env = policies.restore(path, num_envs=episodes, seed=seed, **settings)
+    numbers = episode_statistics(evaluate(agent.actor.policy, env), env.normalised_return)
+    return {
+        "task": cfg.task.name,
+        "practice": cfg.practice.name,
+        "exploration": cfg.exploration.name,
+        "seed": cfg.seed,
+        "steps": run_folder.frames(path),
+        "normalised_return": round(numbers["normalised_return"], 4),
+        "interval": " ".join(f"{end:.4f}" for end in numbers["interval"]),
+        "place": round(numbers["reach"]["place"], 4),
+        "success": round(numbers["metrics"]["success"], 4),
+        "fallen": round(numbers["terminated"], 4),
+        "episodes": episodes,
+        "trained_at": trained_at(path),
+    }
+
+
+def trained_at(path: Path) -> str:
+    """Return the commit at the start of a checkpoint's run."""
+    return run_folder.read_json(path.parents[1] / run_folder.PROVENANCE).get("commit") or ""
+
+
+def curves(rows: list[dict[str, Any]]) -> Iterator[Curve]:
+    """Yield a curve over the seeds of each practice, at the steps that all of them have."""
+    for (practice, exploration), alike in groupby(rows, lambda row: (row["practice"], row["exploration"])):
+        seeds: dict[int, dict[int, float]] = {}
+        for row in alike:
+            seeds.setdefault(row["seed"], {})[row["steps"]] = row["normalised_return"]
+        steps = sorted(set.intersection(*(set(returns) for returns in seeds.values())))
+        values = np.array([[returns[step] for step in steps] for returns in seeds.values()])
+        yield Curve(
+            f"{practice}, {exploration.replace('_', ' ')}",
+            np.array(steps, float),
+            values.mean(0),
+            values.min(0),
+            values.max(0),
+            len(seeds),
+        )
+
+
+if __name__ == "__main__":
+    main()
