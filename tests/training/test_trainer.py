@@ -46,7 +46,7 @@ def pretrained(tmp_path_factory):
 @pytest.mark.parametrize(
     "overrides",
     [
-        [],
+        ["autocast=true"],
         ["method=scratch"],
         ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"],
     ],

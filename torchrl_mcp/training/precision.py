@@ -18,7 +18,6 @@ others at half of it, and Arm processors, where the speed depends on the build o
 import time
 import warnings
 from dataclasses import dataclass
-from statistics import median
 
 import torch
 
@@ -26,7 +25,7 @@ ADVANTAGE = 0.8
 """Largest time of a product in bfloat16, relative to float32, at which bfloat16 is chosen."""
 SHAPE = (256, 1024, 1024)
 """Rows, inputs and outputs of the timed product: a small batch in a wide layer."""
-REPEATS = 5
+REPEATS = 10
 
 
 @dataclass(frozen=True)
@@ -100,25 +99,24 @@ def relative_time(device: torch.device | str) -> float:
     """Return the time of a matrix product in bfloat16 relative to float32, on a CPU with one thread."""
     rows, inputs, outputs = SHAPE
     operands = torch.ones(rows, inputs, device=device), torch.ones(outputs, inputs, device=device)
+    products = [[x.to(dtype) for x in operands] for dtype in (torch.bfloat16, torch.float32)]
     num_threads = torch.get_num_threads()
     torch.set_num_threads(1)  # another run may use the other cores
     try:
-        low, full = (_seconds(*(x.to(dtype) for x in operands)) for dtype in (torch.bfloat16, torch.float32))
+        times = [[_seconds(*product) for product in products] for _ in range(1 + REPEATS)]  # the first prepares kernels
     finally:
         torch.set_num_threads(num_threads)
+    low, full = (min(of_product) for of_product in zip(*times[1:], strict=True))  # without what other processes cost
     return low / full
 
 
 def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
-    """Return the median time of ``rows @ weight.T`` in seconds, after a first product that prepares the kernels."""
-    times = []
-    for _ in range(1 + REPEATS):
-        _wait(rows.device)
-        start = time.perf_counter()
-        torch.nn.functional.linear(rows, weight)
-        _wait(rows.device)
-        times.append(time.perf_counter() - start)
-    return median(times[1:])
+    """Return the time of ``rows @ weight.T`` in seconds."""
+    _wait(rows.device)
+    start = time.perf_counter()
+    torch.nn.functional.linear(rows, weight)
+    _wait(rows.device)
+    return time.perf_counter() - start
 
 
 def _wait(device: torch.device) -> None:
