@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from torch.nn.functional import normalize
 
 from torchrl_mcp.runs import experiment, policies
 
@@ -72,6 +73,26 @@ def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):
     rows = run("ideal.py", tmp_path / "out.csv")
     assert {row["task"] for row in rows} == {"heading", "carry", "dribble", "holdout"}
     assert all(0 < float(row["standing"]) < float(row["ideal"]) <= 1 for row in rows)
+
+
+def test_a_steered_gate_plays_every_task_that_moves_an_object(tmp_path):
+    rows = run("steered.py", tmp_path / "out.csv")
+    assert [row["task"] for row in rows] == ["carry"] * 2 + ["dribble"] * 3
+    assert all(0 < float(row["normalised_return"]) < 1 for row in rows)
+
+
+@pytest.mark.parametrize("target", [(5.0, 0.0), (0.0, 4.0), (-3.0, 0.5)], ids=["beyond the ball", "left", "behind"])
+def test_the_rule_of_the_steered_gate_brings_a_ball_to_its_target(monkeypatch, target):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    behind = runpy.run_path(str(BENCHMARKS / "steered.py"))["behind"]
+    player, ball, target = torch.zeros(1, 2), torch.tensor([[2.0, 0.0]]), torch.tensor([target])
+    for _ in range(1000):  # a point that pushes the ball before it
+        player = player + 0.03 * normalize(behind(ball - player, normalize(target - ball, dim=-1)), dim=-1)
+        apart = ball - player
+        ball = player + apart * (0.3 / apart.norm()).clamp(min=1.0)
+        if (ball - target).norm() < 0.5:
+            return
+    raise AssertionError(f"the ball lies at {ball.tolist()}")
 
 
 def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(tmp_path):
