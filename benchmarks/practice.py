@@ -28,7 +28,9 @@ from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import policies
 from torchrl_mcp.training import run_folder
 
-RESULTS = Path(__file__).resolve().parent / "results"
+RESULTS = Path(__file__).resolve().parent / "results" / "practice"
+SETTINGS = ("practice", "exploration", "logits_std", "gamma")
+"""Settings of training, which runs of a curve have in common."""
 
 
 def main() -> None:
@@ -36,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder of the run folders")
     parser.add_argument("--episodes", type=int, default=64, help="of each evaluation (default 64)")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="folder to write to")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="path of the results without suffix")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
@@ -47,11 +49,11 @@ def main() -> None:
                 print(table([{key: rows[-1][key] for key in list(rows[-1])[:10]}]), flush=True)
     if not rows:
         parser.error(f"{arguments.runs} holds no run with a checkpoint")
-    rows.sort(key=lambda row: (row["task"], row["practice"], row["exploration"], row["seed"], row["steps"]))
-    write(arguments.output / "practice.csv", rows)
+    rows.sort(key=lambda row: (row["task"], *map(str, training(row)), row["seed"], row["steps"]))
+    write(arguments.output.with_suffix(".csv"), rows)
     for task, of_task in groupby(rows, lambda row: row["task"]):
         figure = draw_curves(list(curves(list(of_task))), ylabel="normalised return")
-        save_figure(figure, arguments.output / f"practice_{task}")
+        save_figure(figure, arguments.output.with_name(f"{arguments.output.name}_{task}"))
 
 
 def row(path: Path, episodes: int) -> dict[str, Any]:
@@ -65,6 +67,8 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
         "task": cfg.task.name,
         "practice": cfg.practice.name,
         "exploration": cfg.exploration.name,
+        "logits_std": cfg.exploration.actor.get("logits_std", ""),
+        "gamma": cfg.stage.gamma,
         "seed": cfg.seed,
         "steps": run_folder.frames(path),
         "normalised_return": round(numbers["normalised_return"], 4),
@@ -82,16 +86,22 @@ def trained_at(path: Path) -> str:
     return run_folder.read_json(path.parents[1] / run_folder.PROVENANCE).get("commit") or ""
 
 
+def training(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the settings of a row's training."""
+    return tuple(row[name] for name in SETTINGS)
+
+
 def curves(rows: list[dict[str, Any]]) -> Iterator[Curve]:
-    """Yield a curve over the seeds of each practice, at the steps that all of them have."""
-    for (practice, exploration), alike in groupby(rows, lambda row: (row["practice"], row["exploration"])):
+    """Yield a curve over the seeds of each kind of training, at the steps that all of them have."""
+    varied = [index for index in range(len(SETTINGS)) if len({training(row)[index] for row in rows}) > 1] or [0]
+    for settings, alike in groupby(rows, training):
         seeds: dict[int, dict[int, float]] = {}
         for row in alike:
             seeds.setdefault(row["seed"], {})[row["steps"]] = row["normalised_return"]
         steps = sorted(set.intersection(*(set(returns) for returns in seeds.values())))
         values = np.array([[returns[step] for step in steps] for returns in seeds.values()])
         yield Curve(
-            f"{practice}, {exploration.replace('_', ' ')}",
+            ", ".join(f"{SETTINGS[index]} {settings[index]}".replace("_", " ") for index in varied),
             np.array(steps, float),
             values.mean(0),
             values.min(0),

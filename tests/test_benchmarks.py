@@ -187,7 +187,7 @@ def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_pat
             experiment.train(compose("train", [*settings, f"practice={name}", f"run_dir={tmp_path / 'runs' / name}"]))
     monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.setattr(
-        sys, "argv", ["practice.py", str(tmp_path / "runs"), "--episodes", "3", "--output", str(tmp_path)]
+        sys, "argv", ["practice.py", str(tmp_path / "runs"), "--episodes", "3", "--output", str(tmp_path / "practice")]
     )
     runpy.run_path(str(BENCHMARKS / "practice.py"), run_name="__main__")
     with (tmp_path / "practice.csv").open(newline="") as file:
