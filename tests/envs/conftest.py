@@ -1,10 +1,15 @@
-"""States of the biped and its box, which tests of carrying share."""
+"""A folder of its own for each test, and states of the biped and its box, which tests of carrying share."""
 
 import pytest
 import torch
 
 FRONT = 0.065  # half-thickness of the biped's torso, a box
 HALF_SIZE = 0.15  # of the box
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
 
 
 @pytest.fixture

@@ -10,11 +10,6 @@ from torchrl_mcp.envs import Holdout
 CONTACTS = pytest.mark.parametrize("contact_forces", [False, True], ids=["no_contacts", "contacts"])
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(num_envs=4, **kwargs):
     return Holdout(num_envs, (0.0, 4.0), **{"seed": 0, "num_threads": 1, **kwargs})
 

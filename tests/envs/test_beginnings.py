@@ -12,11 +12,6 @@ from torchrl_mcp.envs.rotations import heading
 MIXED = {"rest": 1.0, "motions": 3.0}
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def draw(initial_states, num=400, character="biped"):
     beginnings = Beginnings(character, initial_states, single_motion(character))
     return beginnings, *beginnings.draw(num, torch.Generator().manual_seed(0))

@@ -13,11 +13,6 @@ FRONT = 0.065  # half-thickness of the biped's torso, a box
 HALF_SIZE = 0.15  # of the box
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(num_envs=2, character="biped", **kwargs):
     return Carry(character, num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 

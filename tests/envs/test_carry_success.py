@@ -9,11 +9,6 @@ from torchrl_mcp.envs import Carry
 HALF_SIZE = 0.15  # of the box
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 @pytest.fixture
 def over_the_target(holding):
     """Make states in which the box that is held is above the target."""

@@ -14,11 +14,6 @@ RATE = -math.log(0.6)  # per second: what loses 40 % in a second
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(num_envs=1, character="biped", **kwargs):
     return Dribble(character, num_envs, **{"seed": 0, "num_threads": 1, "terminate_on_fall": False, **kwargs})
 

@@ -7,11 +7,6 @@ from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.rewards import heading_reward
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(num_envs=64, **kwargs):
     return Heading("biped", num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 

@@ -10,11 +10,6 @@ from torchrl_mcp.envs.rewards import dribble_reward
 LAWS = {"speed": 1.0, "target_distance_power": 2}
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def reach(com, position, target, num_steps, **laws):
     places = (torch.tensor([place], dtype=torch.float64) for place in (com, position, target))
     found = transport_reach(

@@ -20,11 +20,6 @@ TERMS = {"pose": {"weight": 0.6, "scale": 3.0}, "root_pose": {"weight": 0.4, "sc
 SPEED, TURN = 0.6, 0.5
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def gliding(character, *, seconds=2.0, turn=0.0, loop=False):
     """The rest pose, sliding forward at SPEED while turning at the rate ``turn``, 30 frames per second."""
     frames = round(seconds * 30) + 1

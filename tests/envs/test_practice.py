@@ -13,11 +13,6 @@ SCALE = {Carry: 0.25, Dribble: 0.5}
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(task, num_envs=4, **kwargs):
     return task("biped", num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 

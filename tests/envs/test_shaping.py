@@ -15,11 +15,6 @@ GAMMA = 0.97
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(task, num_envs=4, **kwargs):
     settings = {"seed": 0, "num_threads": 1, "dtype": torch.float64, "discount": GAMMA, **NEAR, **kwargs}
     return task("biped", num_envs, **settings)

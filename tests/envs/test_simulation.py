@@ -21,11 +21,6 @@ FRAGILE = """
 """
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 @pytest.fixture
 def ants():
     simulation = BatchSimulation(ant().compile(), 4, substeps=5, outputs=["xpos"], num_threads=1)
@@ -123,7 +118,7 @@ def test_the_time_spent_in_physics_is_counted(ants):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a fork")
 def test_simulations_that_a_fork_inherits_say_so_instead_of_waiting_for_threads_that_are_not_there(ants):
     if not (child := os.fork()):
-        signal.alarm(20)
+        signal.alarm(120)  # a busy machine may leave the child waiting
         try:
             ants.step(torch.zeros(len(ants.state["qpos"]), 8))
         except RuntimeError as error:

@@ -15,11 +15,6 @@ every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(task, character="biped", num_envs=4, **kwargs):
     return task(character, num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 

@@ -11,11 +11,6 @@ from torchrl_mcp.envs import Carry, Dribble
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def make(task, character="biped", num_envs=4, **kwargs):
     return task(character, num_envs, **{"seed": 0, "num_threads": 1, **kwargs})
 

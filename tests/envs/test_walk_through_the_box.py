@@ -16,11 +16,6 @@ TRIALS, STEPS = 8, 150
 AHEAD = {"biped": 1.2, "humanoid": 1.2, "trex": 2.2}  # metres to the box
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 class Guide:
     """The built-in network of a character, which follows a walk along x that waits for it, from eight moments on."""
 

@@ -15,11 +15,6 @@ def _needs_warp():
     pytest.importorskip("mujoco_warp", reason="needs MuJoCo Warp: pip install 'torchrl-mcp[warp]'")
 
 
-@pytest.fixture(autouse=True)
-def _log_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
 def _make(scene, character="biped", num_envs=NUM_ENVS, **kwargs):
     kwargs = {"seed": 0, "num_threads": 1, **kwargs}
     if scene == "holdout":
