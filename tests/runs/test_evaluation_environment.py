@@ -141,13 +141,13 @@ def test_what_training_uses_would_make_another_evaluation(task):
             assert trained[name] != value, name
 
 
-@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping", "emphasis"])
+@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping", "emphasis", "approach"])
 @pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
 def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):
     cfg = configure(task, f"practice={practice}")
     assert evaluated_as(cfg) == evaluated_as(configure(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
-    another = practice in ("shaping", "emphasis") and task != "heading"
+    another = practice in ("shaping", "emphasis", "approach") and task != "heading"
     assert ("task_reward" in env.rollout(2)["next"]) == another
 
 
