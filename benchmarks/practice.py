@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from report import about, table, write
 
 from torchrl_mcp.analysis import draw_curves
@@ -29,7 +29,7 @@ from torchrl_mcp.runs import policies
 from torchrl_mcp.training import run_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "practice"
-SETTINGS = ("practice", "exploration", "logits_std", "gamma")
+SETTINGS = ("after", "practice", "exploration", "logits_std", "gamma")
 """Settings of training, which runs of a curve have in common."""
 
 
@@ -65,6 +65,7 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
     numbers = episode_statistics(evaluate(agent.actor.policy, env), env.normalised_return)
     return {
         "task": cfg.task.name,
+        "after": before(cfg),
         "practice": cfg.practice.name,
         "exploration": cfg.exploration.name,
         "logits_std": cfg.exploration.actor.get("logits_std", ""),
@@ -81,6 +82,14 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
     }
 
 
+def before(cfg: DictConfig) -> str:
+    """Return the practices of the runs before, from the first on, if a run continues with their gate."""
+    if "gating" not in cfg.transfer.keep:
+        return ""
+    first = policies.policy_config(Path(cfg.pretrained))
+    return f"{before(first)} {first.practice.name}".strip()
+
+
 def trained_at(path: Path) -> str:
     """Return the commit at the start of a checkpoint's run."""
     return run_folder.read_json(path.parents[1] / run_folder.PROVENANCE).get("commit") or ""
@@ -91,23 +100,26 @@ def training(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in SETTINGS)
 
 
+def labels(kinds: list[tuple[Any, ...]]) -> list[str]:
+    """Return labels of kinds of training: the stages, and as many other settings as tell them apart."""
+    for last in range(2, len(SETTINGS) + 1):
+        told = [[f"{name} {value}" for name, value in zip(SETTINGS, kind, strict=True)][2:last] for kind in kinds]
+        texts = [", ".join([*kind[0].split(), kind[1], *of_kind]) for kind, of_kind in zip(kinds, told, strict=True)]
+        if len(set(texts)) == len(texts):
+            break
+    return texts
+
+
 def curves(rows: list[dict[str, Any]]) -> Iterator[Curve]:
     """Yield a curve over the seeds of each kind of training, at the steps that all of them have."""
-    varied = [index for index in range(len(SETTINGS)) if len({training(row)[index] for row in rows}) > 1] or [0]
-    for settings, alike in groupby(rows, training):
+    groups = [(kind, list(alike)) for kind, alike in groupby(rows, training)]
+    for label, (_, alike) in zip(labels([kind for kind, _ in groups]), groups, strict=True):
         seeds: dict[int, dict[int, float]] = {}
         for row in alike:
             seeds.setdefault(row["seed"], {})[row["steps"]] = row["normalised_return"]
         steps = sorted(set.intersection(*(set(returns) for returns in seeds.values())))
         values = np.array([[returns[step] for step in steps] for returns in seeds.values()])
-        yield Curve(
-            ", ".join(f"{SETTINGS[index]} {settings[index]}".replace("_", " ") for index in varied),
-            np.array(steps, float),
-            values.mean(0),
-            values.min(0),
-            values.max(0),
-            len(seeds),
-        )
+        yield Curve(label, np.array(steps, float), values.mean(0), values.min(0), values.max(0), len(seeds))
 
 
 if __name__ == "__main__":
