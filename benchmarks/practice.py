@@ -100,10 +100,15 @@ def training(row: dict[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in SETTINGS)
 
 
+def told_apart(name: str, value: Any) -> str:
+    """Return a setting in words: numbers have their name before them."""
+    return (value if name == "exploration" else f"{name} {value}").replace("_", " ")
+
+
 def labels(kinds: list[tuple[Any, ...]]) -> list[str]:
     """Return labels of kinds of training: the stages, and as many other settings as tell them apart."""
     for last in range(2, len(SETTINGS) + 1):
-        told = [[f"{name} {value}" for name, value in zip(SETTINGS, kind, strict=True)][2:last] for kind in kinds]
+        told = [[told_apart(*pair) for pair in zip(SETTINGS, kind, strict=True)][2:last] for kind in kinds]
         texts = [", ".join([*kind[0].split(), kind[1], *of_kind]) for kind, of_kind in zip(kinds, told, strict=True)]
         if len(set(texts)) == len(texts):
             break
