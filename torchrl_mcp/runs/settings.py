@@ -93,7 +93,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         transfer.directions
     """,
     WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
-    WEIGHTS: "emphasis.weights",
+    WEIGHTS: "emphasis.weights approach.weights",
     NAMES: "transfer.freeze transfer.keep",
     TEXT: "device run_dir run_root",
     TEXT.or_null(): "pretrained resume",
