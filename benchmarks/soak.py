@@ -90,7 +90,9 @@ def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: b
     slowest, changed, before, began = 0.0, 0, [], time.monotonic()
     while not ends["done"]:
         begun = (folder / run_folder.CONFIG).exists()
-        patience = math.inf if quick and ends["killed"] else random.uniform(*KILL) / (4 if quick else 1)
+        patience = random.uniform(*KILL)
+        if quick:  # once, early enough for a run of ten seconds
+            patience = math.inf if ends["killed"] else patience / 20
         how, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, patience)
         if how not in ("killed", "disk_full", "done"):
             print(log.read_text(errors="replace")[-3000:], flush=True)
