@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.goals import POSITIONS, goal_layout, logarithmic
 from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.motions.kinematics import BodyStates
@@ -54,9 +55,14 @@ class Transport(TransferTask):
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Set the reward to 1 while successful.
+        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
+            :func:`~torchrl_mcp.envs.goals.logarithmic`. A table is 0.3 m wide, and in standardised metres this is less
+            than a tenth.
         emphasis: ``weights`` of the four terms and ``target_distance_power`` of the reward for training, in which speed
-            terms are 0 while standing still and every term is 1 while successful; None for the task's own. With the
-            printed reward, standing still earns a third of the best return, and policies learn to stand.
+            terms are 0 while standing still; None for the task's own. With the printed reward, standing still earns a
+            third of the best return, and policies learn to stand. A success ends the episode, with the discounted
+            return of all terms being 1 for ever: otherwise a character that walks on knocks the box off the target,
+            and a success is worth little.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: Initial task state of one simulation, in addition to the object's position.
@@ -86,6 +92,7 @@ class Transport(TransferTask):
         speed: float = 1.0,
         target_distance_power: float = 2,
         success_reward: bool = False,
+        goal_positions: str = "metres",
         emphasis: Mapping[str, Any] | None = None,
         max_episode_steps: int = 3000,
         episode: Mapping[str, Tensor] | None = None,
@@ -94,6 +101,9 @@ class Transport(TransferTask):
         not_negative(speed=speed)
         if target_distance_power not in (1, 2):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
+        if goal_positions not in POSITIONS:
+            raise ValueError(f"goal_positions={goal_positions!r} is unknown: pass {' or '.join(POSITIONS)}")
+        self._logarithmic = goal_positions == "logarithmic"
         self.success_reward, self.speed = success_reward, speed
         self.goal_layout = goal_layout(things)
         """Slices of ``goal`` by name."""
@@ -181,6 +191,8 @@ class Transport(TransferTask):
         root, angle = bodies.positions[:, 0], self.heading(ids).to(self._dtype)
         seen = bodies_in_heading_frame(angle, root, bodies).unflatten(-1, (-1, 13))
         own, things = seen.split([len(self._bodies), len(self._shown)], 1)
+        if self._logarithmic:
+            things[..., :2] = logarithmic(things[..., :2])
         shown = [things[:, index, :size] for index, size in enumerate(self._shown.values())]
         return {
             "observation": torch.cat([root[:, 2:], own.flatten(1)], -1),
@@ -208,8 +220,13 @@ class Transport(TransferTask):
             reward = reward.masked_fill(self.success(), 1.0)
         if self._emphasised is None:
             return reward.unsqueeze(0)
-        emphasised = self._emphasised(*state).masked_fill(self.success(), self._full)
-        return torch.stack([reward, emphasised - self._idle])
+        for_ever = (self._full - self._idle) / (1 - self.discount)
+        emphasised = (self._emphasised(*state) - self._idle).masked_fill(self.success(), for_ever)
+        return torch.stack([reward, emphasised])
+
+    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+        reward, terminated = super()._reward_and_termination(diverged)
+        return reward, terminated if self._emphasised is None else terminated | self.success()
 
     def arrows(self, index: int) -> list[Arrow]:
         """Arrows from above the character to the object, and from above the object to the target."""
@@ -217,19 +234,6 @@ class Transport(TransferTask):
             pointer(self._com[index], self._object[index]),
             pointer(self._object[index], self._target[index]),
         ]
-
-
-def goal_layout(things: Mapping[str, int]) -> dict[str, slice]:
-    """Slices of the goal by body and quantity, from the number of entries of each body."""
-    sizes = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
-    layout, start = {}, 0
-    for thing, shown in things.items():
-        end = start + shown
-        for quantity, size in sizes.items():
-            if start < end:
-                layout[f"{thing}.{quantity}"] = slice(start, start + size)
-                start += size
-    return layout
 
 
 def steps(distances: Tensor, directions: Tensor) -> Tensor:

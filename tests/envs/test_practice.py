@@ -50,15 +50,30 @@ def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
         np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
 
 
-def test_what_is_learnt_from_is_full_while_the_ball_is_at_its_target_and_the_character_near():
+def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
+    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 1.0), "terminate_on_fall": False}
+    env = make(Dribble, emphasis=EMPHASIS, discount=0.9, **there)
+    full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
+    for_ever = sum(full * 0.9**step for step in range(1000))
+    state, generator, successes, others = env.reset(), torch.Generator().manual_seed(0), 0, 0
+    for _ in range(60):
+        action = 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
+        taken, state = env.step_and_maybe_reset(state.set("action", action))
+        success, standing = taken["next", "success"], taken["next", "task_reward"] != 0  # who has fallen earns nothing
+        assert torch.equal(taken["next", "terminated"], success)
+        ended = taken["next", "reward"][success & standing]
+        torch.testing.assert_close(ended, torch.full_like(ended, for_ever))
+        assert (taken["next", "reward"][~success] < full).all()
+        successes, others = successes + len(ended), others + int((~success).sum())
+    assert successes > 0
+    assert others > 0
+
+
+def test_without_emphasis_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
-    successes = torch.zeros(2)
-    for state, *_ in outcomes(make(Dribble, emphasis=EMPHASIS, **there), 60, push=1.0):
-        full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
-        success = state["success"][state["reward"] != 0]  # of those who have not fallen
-        assert torch.equal((state["reward"][state["reward"] != 0] - full).abs() < 1e-5, success)
-        successes += torch.stack([success.sum(), (~success).sum()])
-    assert (successes > 0).all()
+    outcome = outcomes(make(Dribble, **there), 1)[0][0]
+    assert outcome["success"].all()
+    assert not outcome["terminated"].any()
 
 
 @every_task

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_mcp.envs import Carry, Dribble
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.goals import logarithmic
 
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 every_character = pytest.mark.parametrize("character", CHARACTERS)
@@ -51,6 +52,29 @@ def test_the_goal_holds_what_mujoco_says_of_the_things_as_seen_by_the_character(
                 case "angular_velocity":
                     expected = turn.apply(velocity[:3])
             np.testing.assert_allclose(shown, expected, atol=1e-12, err_msg=name)
+
+
+@every_task
+def test_logarithmic_goals_have_the_same_directions_and_logarithmic_distances(task):
+    goals = [make(task, goal_positions=form, dtype=torch.float64).reset()["goal"] for form in ("metres", "logarithmic")]
+    layout = make(task).goal_layout
+    for name, place in layout.items():
+        plain, other = (goal[:, place].numpy() for goal in goals)
+        if name.endswith(".position"):
+            way, changed = (positions[:, 0] + 1j * positions[:, 1] for positions in (plain, other))
+            np.testing.assert_allclose(np.angle(changed), np.angle(way), atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(np.expm1(np.abs(changed)), np.abs(way) / 0.25, rtol=1e-12, err_msg=name)
+            plain, other = plain[:, 2:], other[:, 2:]
+        np.testing.assert_array_equal(other, plain, err_msg=name)
+
+
+def test_a_thing_at_the_character_is_at_the_origin_of_logarithmic_goals():
+    assert torch.equal(logarithmic(torch.zeros(1, 2)), torch.zeros(1, 2))
+
+
+def test_an_unknown_form_of_positions_is_named_with_a_remedy():
+    with pytest.raises(ValueError, match="goal_positions='feet' is unknown: pass metres or logarithmic"):
+        make(Dribble, goal_positions="feet")
 
 
 @every_task

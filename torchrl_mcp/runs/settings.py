@@ -93,7 +93,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         transfer.directions
     """,
     WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
-    WEIGHTS: "emphasis.weights approach.weights",
+    WEIGHTS: "emphasis.weights",
     NAMES: "transfer.freeze transfer.keep",
     TEXT: "device run_dir run_root",
     TEXT.or_null(): "pretrained resume",
@@ -101,6 +101,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     _among("any", "same"): "switch_to",
     _among("pyramidal", "elliptic"): "friction_cone",
     _among("mujoco", "warp"): "physics",
+    _among("metres", "logarithmic"): "goal_positions",
 }
 
 RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}
