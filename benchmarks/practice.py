@@ -7,7 +7,7 @@ r"""Learning curves of carrying and dribbling for every kind of training episode
     python benchmarks/practice.py runs/practice    # half a minute a checkpoint; writes results/practice.csv and figures
 
 Every kept checkpoint of a run plays deterministic episodes of ``task.evaluation``, the same for all runs.
-``practice_TASK.png`` has a line for each practice, with the range over its seeds.
+``practice_TASK.png`` and ``practice_TASK_success.png`` have a line for each practice, with the range over its seeds.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from report import about, table, write
 
 from torchrl_mcp.analysis import draw_curves
@@ -29,7 +29,7 @@ from torchrl_mcp.runs import policies
 from torchrl_mcp.training import run_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "practice"
-SETTINGS = ("after", "practice", "exploration", "logits_std", "gamma")
+SETTINGS = ("practice", "exploration", "logits_std", "gamma")
 """Settings of training, which runs of a curve have in common."""
 
 
@@ -52,8 +52,10 @@ def main() -> None:
     rows.sort(key=lambda row: (row["task"], *map(str, training(row)), row["seed"], row["steps"]))
     write(arguments.output.with_suffix(".csv"), rows)
     for task, of_task in groupby(rows, lambda row: row["task"]):
-        figure = draw_curves(list(curves(list(of_task))), ylabel="normalised return")
-        save_figure(figure, arguments.output.with_name(f"{arguments.output.name}_{task}"))
+        found = list(of_task)
+        for name, ending in (("normalised_return", ""), ("success", "_success")):
+            figure = draw_curves(list(curves(found, name)), ylabel=name.replace("_", " "))
+            save_figure(figure, arguments.output.with_name(f"{arguments.output.name}_{task}{ending}"))
 
 
 def row(path: Path, episodes: int) -> dict[str, Any]:
@@ -65,7 +67,6 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
     numbers = episode_statistics(evaluate(agent.actor.policy, env), env.normalised_return)
     return {
         "task": cfg.task.name,
-        "after": before(cfg),
         "practice": cfg.practice.name,
         "exploration": cfg.exploration.name,
         "logits_std": cfg.exploration.actor.get("logits_std", ""),
@@ -80,14 +81,6 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
         "episodes": episodes,
         "trained_at": trained_at(path),
     }
-
-
-def before(cfg: DictConfig) -> str:
-    """Return the practices of the runs before, from the first on, if a run continues with their gate."""
-    if "gating" not in cfg.transfer.keep:
-        return ""
-    first = policies.policy_config(Path(cfg.pretrained))
-    return f"{before(first)} {first.practice.name}".strip()
 
 
 def trained_at(path: Path) -> str:
@@ -106,24 +99,24 @@ def told_apart(name: str, value: Any) -> str:
 
 
 def labels(kinds: list[tuple[Any, ...]]) -> list[str]:
-    """Return labels of kinds of training: the stages, and as many other settings as tell them apart."""
-    for last in range(2, len(SETTINGS) + 1):
-        told = [[told_apart(*pair) for pair in zip(SETTINGS, kind, strict=True)][2:last] for kind in kinds]
-        texts = [", ".join([*kind[0].split(), kind[1], *of_kind]) for kind, of_kind in zip(kinds, told, strict=True)]
+    """Return labels of kinds of training: the practice, and as many other settings as tell them apart."""
+    for last in range(1, len(SETTINGS) + 1):
+        told = [[told_apart(*pair) for pair in zip(SETTINGS[1:last], kind[1:last], strict=True)] for kind in kinds]
+        texts = [", ".join([kind[0], *of_kind]) for kind, of_kind in zip(kinds, told, strict=True)]
         if len(set(texts)) == len(texts):
             break
     return texts
 
 
-def curves(rows: list[dict[str, Any]]) -> Iterator[Curve]:
-    """Yield a curve over the seeds of each kind of training, at the steps that all of them have."""
+def curves(rows: list[dict[str, Any]], name: str) -> Iterator[Curve]:
+    """Yield a curve of a number over the seeds of each kind of training, at the steps that all of them have."""
     groups = [(kind, list(alike)) for kind, alike in groupby(rows, training)]
     for label, (_, alike) in zip(labels([kind for kind, _ in groups]), groups, strict=True):
         seeds: dict[int, dict[int, float]] = {}
         for row in alike:
-            seeds.setdefault(row["seed"], {})[row["steps"]] = row["normalised_return"]
-        steps = sorted(set.intersection(*(set(returns) for returns in seeds.values())))
-        values = np.array([[returns[step] for step in steps] for returns in seeds.values()])
+            seeds.setdefault(row["seed"], {})[row["steps"]] = row[name]
+        steps = sorted(set.intersection(*(set(found) for found in seeds.values())))
+        values = np.array([[found[step] for step in steps] for found in seeds.values()])
         yield Curve(label, np.array(steps, float), values.mean(0), values.min(0), values.max(0), len(seeds))
 
 

@@ -79,7 +79,9 @@ def rows(episodes: int, turns: Sequence[float], **changes: Any) -> Iterator[dict
         evaluated: Any = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
         _, agent, _ = policies.restore(locate(f"builtin:{character}-heading"), num_envs=1, seed=0)
         for turn in turns:
-            env = build.make_env(cfg, num_envs=episodes, seed=12345, **evaluated | changes)
+            env = build.make_env(
+                cfg, num_envs=episodes, seed=12345, **evaluated | {"goal_positions": "metres"} | changes
+            )
             played = evaluate(SteeredPolicy(env, agent.actor.policy, turn), env)
             numbers = episode_statistics(played, env.normalised_return)
             yield {

@@ -200,20 +200,4 @@ def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_pat
     assert float(rows[-1]["normalised_return"]) == pytest.approx(found["normalised_return"], abs=1e-4)
     assert float(rows[-1]["success"]) == found["metrics"]["success"]
     assert (tmp_path / "practice_dribble.png").exists()
-
-
-def test_a_player_that_is_moved_by_hand_turns_and_approaches_as_it_was_moved(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    turning = runpy.run_path(str(BENCHMARKS / "turning.py"))
-    time = torch.arange(90.0).unsqueeze(-1) / 30
-    spot = torch.tensor([[5.0, 0.0]])
-    recorded = {
-        "heading": (3.0 + 0.4 * time) % (2 * torch.pi),  # to the left at 0.4 rad/s, past pi
-        "running": torch.ones(90, 1, dtype=torch.bool),
-        "object": torch.stack([torch.zeros(90, 1), 5 - 0.5 * time], -1),  # on the left, nearer by 0.5 m/s
-        "target": spot.expand(90, 1, 2),
-    }
-    rows = list(turning["sectors"](recorded))
-    found = [row for row in rows if row["share"]]
-    assert [(row["where"], row["direction"], row["share"]) for row in found] == [("away", 90, 1.0)]
-    assert (found[0]["turn"], found[0]["approach"]) == (0.4, 0.5)
+    assert (tmp_path / "practice_dribble_success.png").exists()
