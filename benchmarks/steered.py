@@ -77,11 +77,10 @@ def rows(episodes: int, turns: Sequence[float], **changes: Any) -> Iterator[dict
         with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
             cfg = compose("train", [f"task={task}", f"character={character}", "stage=transfer"])
         evaluated: Any = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
+        evaluated["goal_positions"] = "metres"  # for the rule
         _, agent, _ = policies.restore(locate(f"builtin:{character}-heading"), num_envs=1, seed=0)
         for turn in turns:
-            env = build.make_env(
-                cfg, num_envs=episodes, seed=12345, **evaluated | {"goal_positions": "metres"} | changes
-            )
+            env = build.make_env(cfg, num_envs=episodes, seed=12345, **evaluated | changes)
             played = evaluate(SteeredPolicy(env, agent.actor.policy, turn), env)
             numbers = episode_statistics(played, env.normalised_return)
             yield {
