@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from report import about, table, write
+from report import about, earned, table, write
 
 from torchrl_mcp.analysis import draw_curves
 from torchrl_mcp.analysis.curves import Curve
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import policies
 from torchrl_mcp.training import run_folder
 
@@ -64,7 +63,6 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
     evaluation: Any = OmegaConf.to_container(cfg.evaluation, resolve=True)
     seed, settings = evaluation["seed"], evaluation["environment"]
     _, agent, env = policies.restore(path, num_envs=episodes, seed=seed, **settings)
-    numbers = episode_statistics(evaluate(agent.actor.policy, env), env.normalised_return)
     return {
         "task": cfg.task.name,
         "practice": cfg.practice.name,
@@ -73,12 +71,7 @@ def row(path: Path, episodes: int) -> dict[str, Any]:
         "gamma": cfg.stage.gamma,
         "seed": cfg.seed,
         "steps": run_folder.frames(path),
-        "normalised_return": round(numbers["normalised_return"], 4),
-        "interval": " ".join(f"{end:.4f}" for end in numbers["interval"]),
-        "place": round(numbers["reach"]["place"], 4),
-        "success": round(numbers["metrics"]["success"], 4),
-        "fallen": round(numbers["terminated"], 4),
-        "episodes": episodes,
+        **earned(agent.actor.policy, env),
         "trained_at": trained_at(path),
     }
 

@@ -17,14 +17,13 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from report import about, table, write
+from report import about, earned, table, write
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.transport import Transport
-from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.builtin import locate
 
@@ -81,19 +80,8 @@ def rows(episodes: int, turns: Sequence[float], **changes: Any) -> Iterator[dict
         _, agent, _ = policies.restore(locate(f"builtin:{character}-heading"), num_envs=1, seed=0)
         for turn in turns:
             env = build.make_env(cfg, num_envs=episodes, seed=12345, **evaluated | changes)
-            played = evaluate(SteeredPolicy(env, agent.actor.policy, turn), env)
-            numbers = episode_statistics(played, env.normalised_return)
-            yield {
-                "task": task,
-                "character": character,
-                "turn": round(turn, 2),
-                "normalised_return": round(numbers["normalised_return"], 3),
-                "interval": " ".join(f"{end:.3f}" for end in numbers["interval"]),
-                "place": round(numbers["reach"]["place"], 3),
-                "success": round(numbers["metrics"]["success"], 3),
-                "fallen": round(numbers["terminated"], 3),
-                "episodes": episodes,
-            }
+            player = SteeredPolicy(env, agent.actor.policy, turn)
+            yield {"task": task, "character": character, "turn": round(turn, 2), **earned(player, env)}
 
 
 def main() -> None:
