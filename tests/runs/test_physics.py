@@ -21,7 +21,7 @@ At rest, the last bit decides whether a character touches it, and so do the firs
 difference of 0.01 to the humanoid's return, with either engine.
 """
 APART = 0.15
-"""Largest relative difference of the returns after a pre-training: pairs of four seeds differed by 3 to 7 percent."""
+"""Largest relative difference of the returns after a pre-training: pairs of four seeds differed by 2 to 7 percent."""
 
 
 def composed(*overrides):

@@ -144,7 +144,9 @@ def test_a_fall_from_above_stays_together_for_a_second(make, actions):
     torch.testing.assert_close(states[0]["reward"], states[1]["reward"], atol=1e-2, rtol=0)
 
 
-@pytest.mark.parametrize("character", ["biped", pytest.param("trex", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "character", ["biped", *(pytest.param(name, marks=pytest.mark.slow) for name in ("humanoid", "trex"))]
+)
 def test_who_stands_still_is_held_up_by_its_weight_and_loses_its_energy(make, character):
     env = make("heading", character, 2, physics="warp", terminate_on_fall=False)
     state, still = env.reset(), torch.zeros(env.action_spec.shape)
