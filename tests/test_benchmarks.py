@@ -157,6 +157,35 @@ def test_tasks_are_measured_beside_bare_mujoco(tmp_path):
     assert 0 < float(row["physics"]) < 1
 
 
+def test_a_gpu_that_is_not_there_is_told_before_anything_is_measured(tmp_path, capsys):
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(SystemExit):
+        run("gpu_throughput.py", tmp_path / "out.csv")
+    assert "finds no CUDA device" in capsys.readouterr().err
+    assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.slow
+def test_throughput_on_a_gpu_is_rehearsed_without_one(tmp_path):
+    pytest.importorskip("mujoco_warp", reason="needs MuJoCo Warp: pip install 'torchrl-mcp[warp]'")
+    rows = measured("gpu_throughput.py", tmp_path / "out.csv", "--device", "cpu")
+    assert [row["physics"] for row in rows] == ["warp", "mujoco"]
+    assert {row["device"] for row in rows} == {"cpu"}
+    assert all(float(row[name]) > 0 for row in rows for name in ("steps", "samples", "setup_seconds"))
+
+
+@pytest.mark.slow
+def test_every_scene_has_room_for_its_contacts_and_constraints_on_warp(tmp_path):
+    pytest.importorskip("mujoco_warp", reason="needs MuJoCo Warp: pip install 'torchrl-mcp[warp]'")
+    rows = run("contact_room.py", tmp_path / "out.csv")
+    assert len({row["scene"] for row in rows}) == 16
+    for row in rows:
+        assert 0 < float(row["of_contacts"]) < 0.8, row["scene"]
+        assert 0 < float(row["of_constraints"]) < 0.8, row["scene"]
+        assert row["faults"] == "0"
+
+
 def test_the_model_of_scaling_finds_the_constants_that_made_the_times_and_predicts_by_them(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     scaling = runpy.run_path(str(BENCHMARKS / "scaling.py"))

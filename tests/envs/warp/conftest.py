@@ -1,9 +1,13 @@
 from importlib.util import find_spec
+from unittest.mock import patch
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library, holdout
+from torchrl_mcp.envs.characters import ant
 
 NUM_ENVS = 8
 TASKS = {"heading": Heading, "carry": Carry, "dribble": Dribble}
@@ -18,10 +22,17 @@ def _needs_warp():
 def _make(scene, character="biped", num_envs=NUM_ENVS, **kwargs):
     kwargs = {"seed": 0, "num_threads": 1, **kwargs}
     if scene == "holdout":
-        return Holdout(num_envs, (0.0, 6.0), **kwargs)
+        cone = kwargs.pop("friction_cone", "pyramidal")
+        with patch.object(holdout, "ant", lambda: _with_cone(ant(), cone)):
+            return Holdout(num_envs, (0.0, 6.0), **kwargs)
     if scene == "imitation":
         return Imitation(character, generated_library(character, seed=0), num_envs, terms=TERMS, **kwargs)
     return TASKS[scene](character, num_envs, **kwargs)
+
+
+def _with_cone(spec, cone):
+    spec.option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[cone]
+    return spec
 
 
 @pytest.fixture(scope="session")
@@ -38,4 +49,26 @@ def actions():
     )
 
 
-collect_ignore = [] if find_spec("mujoco_warp") else ["test_simulation.py", "test_parity.py"]
+@pytest.fixture(scope="session")
+def held():
+    """Makes states of carrying in which every character holds its box at another pose, ``height`` metres up."""
+
+    def take(env, height=0.0, seed=0):
+        env.reset()
+        state, drawn = env.get_state(), np.random.default_rng(seed)
+        state["qpos"][:, [2, -5]] += height
+        env.reset(state, set_state=True)
+        for index, row in enumerate(state["qpos"].numpy()):
+            carrier = env.simulation.data(index).body(env.character.carrier)
+            place, turn = drawn.uniform(0.2, 0.4, 3), drawn.normal(size=4)
+            turn /= np.linalg.norm(turn)
+            mujoco.mju_mulPose(row[-7:-4], row[-4:], carrier.xpos, carrier.xquat, place, turn)
+            state["eq_data"][index, 0, 3:10] = torch.from_numpy(np.concatenate([place, turn]))
+        state["eq_active"][:], state["taken"][:] = 1, 1
+        return state
+
+    return take
+
+
+# It imports the extra; the other tests skip without it.
+collect_ignore = [] if find_spec("mujoco_warp") else ["test_simulation.py"]

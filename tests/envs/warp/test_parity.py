@@ -1,5 +1,7 @@
 """MuJoCo Warp computes what MuJoCo does, as far as float32 can tell, on Warp's CPU device."""
 
+from functools import partial
+
 import mujoco
 import pytest
 import torch
@@ -10,7 +12,7 @@ NUM_STEPS = 100
 
 # Largest difference after one control step from the same state, but for RARE. Resolution of float32: 6e-8 of a number.
 TOLERANCES = {
-    "time": 1e-6,  # seconds: sums of steps
+    "time": 2e-6,  # seconds: a sum of steps, up to 5 s
     "qpos": 3e-6,  # metres and parts of quaternions: places are a few metres, rounded in each of 20 operations
     "qvel": 5e-4,  # m/s and rad/s: rounded accelerations of up to 1e4 in each physics step of 1/120 s
     "xpos": 3e-6,
@@ -21,26 +23,45 @@ TOLERANCES = {
     "cvel": 5e-4,
     "sensordata": 1e-5,  # metres between shapes
 }
-RARE = 0.05
+RARE = 0.005
 """Share of the simulations and steps with larger differences.
 
 Whether a shape that hardly touches another is in contact is decided by the last bit, and so is the physics step in
 which a contact begins: a foot that stands on the ground lies 2e-9 m below it in float32, and above it in float64.
 """
-ON_CAPSULES = 0.6
-"""The same share of ants and T-Rexes, with pyramids of friction.
-
-They walk on the ends of capsules. MuJoCo turns the pyramids of steep capsules with them, and Warp does not.
-"""
+OFTEN = 0.05
+"""The same share where tolerances are those of one of the two differences below."""
+# A box in hand: with its solimp, the joint is a thousand times as stiff as what it joins, and so are the errors of
+# rounding in its forces. Two to four Newton steps in float32 leave 1e-3 m/s in the median.
+HOLDING = TOLERANCES | {"qvel": 1e-2, "cvel": 1e-2, "geom_xmat": 2e-4} | dict.fromkeys(
+    ("qpos", "xpos", "xquat", "geom_xpos", "subtree_com", "sensordata"), 1e-4
+)  # fmt: skip
+# Pyramids of friction under capsules that stand within 30 degrees of upright, as those of ant and T-Rex: MuJoCo turns
+# their edges with the capsule, Warp does not. Turned by 45 degrees, a pyramid of friction coefficient 1 lets through
+# 1.4 times the force, so that a sliding foot is accelerated by up to 4 m/s^2 more: 0.13 m/s and 2 mm in 1/30 s, 0.2 m/s
+# and 5 mm in the ant's 0.05 s, and twice that in radians, at joints half a metre above the foot.
+ON_PYRAMIDS = TOLERANCES | {"qpos": 5e-3, "qvel": 0.4, "xpos": 1e-2, "xquat": 1e-2, "geom_xpos": 1e-2,
+                            "geom_xmat": 2e-2, "subtree_com": 5e-3, "cvel": 0.4}  # fmt: skip
 LIFT = 0.01
 """Metres by which characters begin above the ground, so that the first contacts are not decided by the last bit."""
+CONES = {"biped": ["pyramidal"], "humanoid": ["pyramidal"], "trex": ["pyramidal", "elliptic"]}
 SCENES = [
-    *(("heading", character, {}, RARE) for character in ("biped", "humanoid")),
-    ("heading", "trex", {"friction_cone": "elliptic"}, RARE),
-    ("heading", "trex", {}, ON_CAPSULES),
-    *((scene, "biped", {}, RARE) for scene in ("carry", "dribble", "imitation")),
-    ("holdout", "ant", {}, ON_CAPSULES),
+    *(
+        (scene, character, cone)
+        for scene in ("heading", "carry", "dribble", "imitation")
+        for character, cones in CONES.items()
+        for cone in cones
+    ),
+    *(("holding", character, cones[-1]) for character, cones in CONES.items()),
+    *(("holdout", "ant", cone) for cone in CONES["trex"]),
 ]
+
+
+def tolerances(scene, character, cone):
+    """Tolerances and the share that may exceed them."""
+    if scene == "holding":
+        return HOLDING, OFTEN
+    return (ON_PYRAMIDS, OFTEN) if character in ("trex", "ant") and cone == "pyramidal" else (TOLERANCES, RARE)
 
 
 def lasting(scene):
@@ -52,13 +73,17 @@ def lasting(scene):
     )
 
 
-def differences(make, actions, scene, character, num_steps, **kwargs):
+@pytest.fixture
+def differences(make, actions, held):
     """Largest differences of state and outputs in each simulation after steps from the same states, ``(T, N)``."""
-    ours, exact = (
-        make(scene, character, physics=physics, **lasting(scene), **kwargs) for physics in ("warp", "mujoco")
-    )
+    return partial(_differences, make, actions, held)
+
+
+def _differences(make, actions, held, scene, character, num_steps, **kwargs):
+    task, found = "carry" if scene == "holding" else scene, {}
+    ours, exact = (make(task, character, physics=physics, **lasting(task), **kwargs) for physics in ("warp", "mujoco"))
     exact.reset()
-    lifted, found = exact.get_state(), {}
+    lifted = held(exact) if scene == "holding" else exact.get_state()
     lifted["qpos"][:, 2] += LIFT
     state = exact.reset(lifted, set_state=True)
     for action in actions(exact, num_steps):
@@ -77,21 +102,21 @@ def differences(make, actions, scene, character, num_steps, **kwargs):
     return {name: torch.stack(parts) for name, parts in found.items()}
 
 
-def require_parity(found, rare=RARE):
+def require_parity(found, tolerances, rare):
     for name, apart in found.items():
-        assert (apart > TOLERANCES[name]).double().mean() <= rare, (name, apart.flatten().sort().values[-20:])
+        assert (apart > tolerances[name]).double().mean() <= rare, (name, apart.flatten().sort().values[-20:])
 
 
-def test_a_control_step_from_the_same_state_is_mujocos(make, actions):
-    require_parity(differences(make, actions, "heading", "biped", 10))
+def test_a_control_step_from_the_same_state_is_mujocos(differences):
+    require_parity(differences("heading", "biped", 10), *tolerances("heading", "biped", "pyramidal"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "character", "kwargs", "rare"), SCENES)
-def test_every_control_step_of_every_scene_is_mujocos(make, actions, scene, character, kwargs, rare):
-    found = differences(make, actions, scene, character, NUM_STEPS, **kwargs)
+@pytest.mark.parametrize(("scene", "character", "cone"), SCENES)
+def test_every_control_step_of_every_scene_is_mujocos(differences, scene, character, cone):
+    found = differences(scene, character, NUM_STEPS, friction_cone=cone)
     assert {"qpos", "qvel"} <= found.keys()
-    require_parity(found, rare)
+    require_parity(found, *tolerances(scene, character, cone))
 
 
 def test_observations_and_rewards_of_the_same_state_are_those_of_mujocos_threads(make, actions):
@@ -119,7 +144,9 @@ def test_a_fall_from_above_stays_together_for_a_second(make, actions):
     torch.testing.assert_close(states[0]["reward"], states[1]["reward"], atol=1e-2, rtol=0)
 
 
-@pytest.mark.parametrize("character", ["biped", pytest.param("trex", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "character", ["biped", *(pytest.param(name, marks=pytest.mark.slow) for name in ("humanoid", "trex"))]
+)
 def test_who_stands_still_is_held_up_by_its_weight_and_loses_its_energy(make, character):
     env = make("heading", character, 2, physics="warp", terminate_on_fall=False)
     state, still = env.reset(), torch.zeros(env.action_spec.shape)
