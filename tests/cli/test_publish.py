@@ -138,6 +138,11 @@ def test_every_gate_that_comes_with_the_library_has_a_card_and_does_its_task(gat
     page = (gate.parents[2] / "docs" / "networks.md").read_text()
     assert gate.with_suffix(".md").is_file()
     assert f"networks/{gate.stem}.md" in page
-    numbers = policies.evaluate_run(gate, episodes=4, seed=0, max_episode_steps=120)["deterministic"]
-    assert numbers["terminated"] == 0.0
-    assert numbers["reach"]["place"] > (0.5 if "heading" in gate.stem else 0.0)
+    if "heading" in gate.stem:
+        numbers = policies.evaluate_run(gate, episodes=4, seed=0, max_episode_steps=120)["deterministic"]
+        assert numbers["terminated"] == 0.0
+        assert numbers["reach"]["place"] > 0.5
+    else:
+        near = {"object_distances": (1.0, 2.0), "target_distances": (1.0, 2.0), "max_episode_steps": 450}
+        numbers = policies.evaluate_run(gate, episodes=16, seed=0, emphasis=None, mixture=[], **near)["deterministic"]
+        assert numbers["metrics"]["success"] > 0.1

@@ -146,6 +146,13 @@ def test_what_training_uses_would_make_another_evaluation(task):
             assert trained[name] != value, name
 
 
+@pytest.mark.parametrize("character", ["humanoid", "trex"])
+@pytest.mark.parametrize("task", ["carry", "dribble"])
+def test_near_objects_of_training_are_clear_of_every_character(task, character):
+    cfg = configure(task, f"character={character}", "practice=emphasis")
+    build.make_env(cfg, num_envs=2, seed=0).reset()
+
+
 @pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping", "emphasis"])
 @pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
 def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):

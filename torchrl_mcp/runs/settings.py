@@ -88,7 +88,8 @@ NAMES_BY_RULE: dict[Rule, str] = {
         terminate_when_unhealthy success_reward parts.blind regret_per_step staggered
     """,
     RANGE: """
-        healthy_z_range initial_directions object_distances object_directions target_distances target_directions
+        healthy_z_range initial_directions near_objects object_distances
+        object_directions target_distances target_directions
         evaluation.directions environment.directions directions.pretrain directions.transfer pretrain.directions
         transfer.directions
     """,
