@@ -108,6 +108,10 @@ class Transport(TransferTask):
         self.goal_layout = goal_layout(things)
         """Slices of ``goal`` by name."""
         self._shown = dict(things)
+        if emphasis is not None and kwargs.get("discount") == 1:
+            raise ValueError(
+                "emphasis with discount=1: a success is worth full reward for ever, pass a discount below 1"
+            )
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
         self._emphasised, self._idle, self._full = None, 0.0, 1.0
         if emphasis is not None:
@@ -220,13 +224,15 @@ class Transport(TransferTask):
             reward = reward.masked_fill(self.success(), 1.0)
         if self._emphasised is None:
             return reward.unsqueeze(0)
-        for_ever = (self._full - self._idle) / (1 - self.discount)
-        emphasised = (self._emphasised(*state) - self._idle).masked_fill(self.success(), for_ever)
-        return torch.stack([reward, emphasised])
+        return torch.stack([reward, self._emphasised(*state) - self._idle])
 
     def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         reward, terminated = super()._reward_and_termination(diverged)
-        return reward, terminated if self._emphasised is None else terminated | self.success()
+        if self._emphasised is None:
+            return reward, terminated
+        succeeded = self.success() & ~terminated
+        for_ever = (self._full - self._idle) / (1 - self.discount)
+        return reward.masked_fill(succeeded, for_ever), terminated | succeeded
 
     def arrows(self, index: int) -> list[Arrow]:
         """Arrows from above the character to the object, and from above the object to the target."""

@@ -39,6 +39,18 @@ def joined(env):
     return env.simulation.state["eq_active"].flatten().tolist()
 
 
+def test_a_box_that_stands_on_the_target_when_the_joint_opens_ends_the_episode_with_full_reward_for_ever(
+    over_the_target,
+):
+    weights = [1.0, 0.2, 1.0, 2.0]
+    env = make(emphasis={"weights": weights, "target_distance_power": 1}, discount=0.9)
+    outcome = play(env, env.reset(over_the_target(env, 0.005), set_state=True), 1)
+    full = sum(weights) - np.exp(-1.5) - np.exp(-1)
+    assert outcome["success"].all()
+    assert outcome["terminated"].all()
+    np.testing.assert_allclose(outcome["reward"], 10 * full, rtol=1e-6)
+
+
 @pytest.mark.parametrize("clearance", [0.005, 0.05])
 def test_the_joint_opens_over_the_target_and_the_box_then_stands_there(clearance, over_the_target):
     env = make()

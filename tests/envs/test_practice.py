@@ -69,6 +69,11 @@ def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
     assert others > 0
 
 
+def test_full_reward_for_ever_needs_a_discount():
+    with pytest.raises(ValueError, match=r"emphasis with discount=1: .* pass a discount below 1"):
+        make(Dribble, emphasis=EMPHASIS, discount=1)
+
+
 def test_without_emphasis_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     outcome = outcomes(make(Dribble, **there), 1)[0][0]
