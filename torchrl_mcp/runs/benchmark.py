@@ -165,7 +165,7 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
             del cfg["hydra"]
         build.require_valid(cfg)
         build.require_environment(cfg)
-        config: Any = OmegaConf.to_container(cfg, resolve=True)
+        config: Any = OmegaConf.to_container(experiment.settled(cfg), resolve=True)
     finally:
         HydraConfig.instance().cfg = former
     return Job(Path(config["run_dir"]), overrides, config)

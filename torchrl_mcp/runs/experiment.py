@@ -68,6 +68,19 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
         return _resume(folder) if (folder / CONFIG).exists() else _train(cfg)
 
 
+def settled(cfg: DictConfig) -> DictConfig:
+    """Return the configuration with the width of the kept networks: that of the pre-training that they come from.
+
+    Raises:
+        ValueError: If there is no such pre-training.
+    """
+    path = _pretrained(cfg) if cfg.stage.name == "transfer" and cfg.pretrained else None
+    if path is None:
+        return cfg
+    width = checkpoint.saved_config(path).get("width", 1.0)  # older networks have the paper's
+    return cast("DictConfig", OmegaConf.merge(cfg, {"kept_width": width}))
+
+
 def run_config(folder: Path) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
@@ -113,7 +126,7 @@ def _train(cfg: DictConfig) -> Path:
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
     print(f"{folder}: {precision}", flush=True)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, {"autocast": precision.autocast}))
+    cfg = cast("DictConfig", OmegaConf.merge(settled(cfg), {"autocast": precision.autocast}))
     trainer = _trainer(cfg, folder, pretrained)
     trainer.save()
     write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)

@@ -71,7 +71,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     SEED: "seed",
     POSITIVE: """
         lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale reach
-        max_error width
+        max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",

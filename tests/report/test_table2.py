@@ -1,0 +1,138 @@
+"""The benchmark's Table 2 of runs whose numbers are made up, and the archive of the published runs."""
+
+import csv
+import json
+import re
+import runpy
+import sys
+import tarfile
+from collections import defaultdict
+from pathlib import Path
+from statistics import mean
+
+import pytest
+
+from torchrl_mcp.cli import report
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "benchmarks/table2.py"
+PUBLISHED = ROOT / "benchmarks/results/table2"
+
+
+def tabulate(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *map(str, arguments)])
+    monkeypatch.syspath_prepend(str(SCRIPT.parent))
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+
+
+def unpack(archive, folder):
+    with tarfile.open(archive) as packed:
+        packed.extractall(folder, filter="data")
+    return folder
+
+
+def cells_of(markdown):
+    """The cells of a Markdown table, a list for each line, without the rule."""
+    lines = [line for line in markdown.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in (lines[0], *lines[2:])]
+
+
+@pytest.fixture
+def results(tmp_path, run_writers, monkeypatch):
+    root = tmp_path / "runs"
+    write, write_mcp = run_writers(root)
+    write_mcp("source", stage="pretrain", task="imitation", score=0.5)
+    imitated = json.loads((root / "source/evaluation.json").read_text())
+    for mode in ("deterministic", "stochastic"):
+        imitated[mode]["metrics"] = {"tracking_error": 0.05}
+    (root / "source/evaluation.json").write_text(json.dumps(imitated))
+    write_mcp("gate", score=0.9, pretrained=str(root / "source"))
+    for seed, score in enumerate((0.8, 0.9)):
+        write(f"long{seed}", score=score, seed=seed, total_frames=4000)
+        write(f"short{seed}", score=score - 0.5, seed=seed)
+    write("unfinished", seed=2, progress=0.5)
+    tabulate(monkeypatch, root, "--output", tmp_path / "results")
+    return tmp_path / "results"
+
+
+def test_our_numbers_stand_above_the_papers_with_their_seeds(results):
+    head, heading, paper, *others = cells_of((results / "table.md").read_text())
+    found = dict(zip(head, zip(heading, paper, strict=True), strict=True))
+    assert found == {
+        "": ("heading, Biped", "*paper*"),
+        "Scratch": ("0.850 (2)", "*0.927*"),
+        "Scratch, short": ("0.350 (2)", ""),
+        "Finetune": ("", "*0.970*"),
+        "Hierarchical": ("", "*0.834*"),
+        "Option critic": ("", "*0.952*"),
+        "MOE": ("", "*0.918*"),
+        "Latent space": ("", "*0.970*"),
+        "MCP": ("0.900 (1)", "*0.976*"),
+    }
+    assert len(others) == 14
+    assert not any("(" in cell for row in others for cell in row)  # no runs of the other rows
+
+
+def test_every_task_has_a_table_and_curves(results):
+    head, *rows = cells_of((results / "heading_biped.md").read_text())
+    found = [dict(zip(head, row, strict=True)) for row in rows]
+    assert [row[""] for row in found] == ["Scratch, 0.0 M steps", "Scratch, 0.0 M steps", "MCP"]
+    assert [row["steps"] for row in found] == ["1,000", "4,000", "1,000"]
+    assert [row["deterministic"] for row in found] == ["0.350 ± 0.071", "0.850 ± 0.071", "0.900"]
+    assert {row["fallen"] for row in found} == {"25%"}
+    head, row = cells_of((results / "imitation_biped.md").read_text())
+    assert dict(zip(head, row, strict=True))["completed"] == "75%"
+    assert (results / "heading_biped.png").stat().st_size > 0
+    with (results / "runs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12  # six runs in two modes
+    assert {row["commit"] for row in rows} == {"abc1234"}
+
+
+def test_the_archive_gives_the_same_results_again(results, tmp_path, monkeypatch):
+    again = tmp_path / "again"
+    again.mkdir()
+    (again / "runs.tar.xz").write_bytes((results / "runs.tar.xz").read_bytes())
+    tabulate(monkeypatch, "--output", again)
+    for name in ("table.md", "heading_biped.md", "imitation_biped.md", "runs.csv"):
+        assert (again / name).read_text() == (results / name).read_text()
+    kept = unpack(results / "runs.tar.xz", tmp_path / "kept")
+    assert not any(str(tmp_path) in path.read_text() for path in kept.rglob("*.*"))
+
+
+def test_without_runs_and_archive_the_script_says_what_it_needs(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        tabulate(monkeypatch, "--output", tmp_path)
+    assert "give the folder of the runs" in capsys.readouterr().err
+
+
+def test_the_published_runs_make_the_readmes_table(tmp_path, monkeypatch):
+    """The table in the README has the mean of the evaluations in the archive, cell by cell."""
+    runs = unpack(PUBLISHED / "runs.tar.xz", tmp_path / "runs")
+    returns = defaultdict(list)
+    for path in runs.rglob("evaluation.json"):
+        settings = path.with_name("config.yaml").read_text()
+        task, character, method = (
+            re.search(rf"^{group}:\n(?:  .*\n)*?  name: (\w+)", settings, re.MULTILINE)[1]
+            for group in ("task", "character", "method")
+        )
+        steps = int(re.search(r"total_frames: (\d+)", settings)[1])
+        value = json.loads(path.read_text())["deterministic"]["normalised_return"]
+        returns[task, character, method, steps].append(value)
+    table = (PUBLISHED / "table.md").read_text()
+    assert table in (ROOT / "README.md").read_text()
+    head, *lines = cells_of(table)
+    shown = {
+        (line[0], column): cell for line in lines[::2] for column, cell in zip(head[1:], line[1:], strict=True) if cell
+    }
+    assert shown
+    for (row, column), cell in shown.items():
+        task, character = row.lower().replace("t-rex", "trex").split(", ")
+        method = column.removesuffix(", short").lower().replace(" ", "_")
+        budgets = {steps: seeds for (*named, steps), seeds in returns.items() if named == [task, character, method]}
+        values = budgets[min(budgets) if column.endswith("short") else max(budgets)]
+        assert cell == f"{mean(values):.3f} ({len(values)})"
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(runs), "--output", str(tmp_path / "report")])
+    report.main()
+    page = (tmp_path / "report/report.md").read_text()
+    assert all(cell.partition(" ")[0] in page for cell in shown.values())
