@@ -27,7 +27,7 @@ COLLECTORS = {
     "processes": [f"collector.num_workers={CORES}"],
     "ray": [f"collector.num_workers={CORES}"],
 }
-COMMON = ["method=scratch", "task=holdout", "stage=transfer"]
+COMMON = ["method=scratch", "task=holdout", "stage=transfer", "width=1.0", "learned_std=false"]
 QUIET = ["logger=none", "progress_bar=false", "evaluation.episodes=0"]
 
 

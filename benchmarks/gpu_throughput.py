@@ -59,6 +59,7 @@ def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, 
         "training.num_epochs": EPOCHS,
         "training.total_frames": samples * (1 + iterations),
         "checkpoint_interval": 10**9,
+        "width": 1.0,
         **{"logger": "none", "progress_bar": False, "run_dir": "."},
     }
     cfg = build.compose_run(*(f"{name}={value}" for name, value in settings.items()))

@@ -3,10 +3,11 @@
     python benchmarks/heading.py                      # trains missing runs: an hour or two per character on a core
     python benchmarks/heading.py --report             # trains nothing
 
-Every character learns with ``method=scratch task=heading preset=fast character.action_std=0.15`` for the steps in
-``CHARACTERS``. Run folders are in ``--output``; stopped runs are resumed. The report plays one episode of 20 s in each
-of ``--episodes`` environments and writes ``results/heading.csv``, ``heading_curves.csv``, ``.png`` and ``.svg``, and a
-film of each character, ``heading_<character>.gif`` (MUJOCO_GL=egl or osmesa without a display).
+Every character learns with ``method=scratch task=heading preset=fast width=1.0 learned_std=false
+character.action_std=0.15`` for the steps in ``CHARACTERS``. Run folders are in ``--output``; stopped runs are resumed.
+The report plays one episode of 20 s in each of ``--episodes`` environments and writes ``results/heading.csv``,
+``heading_curves.csv``, ``.png`` and ``.svg``, and a film of each character, ``heading_<character>.gif``
+(MUJOCO_GL=egl or osmesa without a display).
 """
 
 import argparse
@@ -28,7 +29,10 @@ from torchrl_mcp.viewer.film import save_film
 RESULTS = Path(__file__).resolve().parent / "results"
 CHARACTERS = {"biped": 4_000_000, "humanoid": 3_000_000, "trex": 1_000_000}
 PAPER = {"biped": "0.927 +- 0.032", "humanoid": "0.965 +- 0.010", "trex": "0.840 +- 0.003"}
-COMMON = ["method=scratch", "task=heading", "preset=fast", "logger=none", "torch_threads=1", "num_threads=1"]
+COMMON = [
+    *("method=scratch", "task=heading", "preset=fast", "width=1.0", "learned_std=false"),
+    *("logger=none", "torch_threads=1", "num_threads=1"),
+]
 EVALUATION_SEED = 12345
 
 

@@ -31,7 +31,10 @@ from torchrl_mcp.training.run_folder import CONFIG
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PRETRAINING, TRANSFER = 1_000_000, 600_000
-COMMON = ["task=holdout", "preset=fast", "logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false"]
+COMMON = [
+    *("task=holdout", "preset=fast", "width=1.0", "learned_std=false"),
+    *("logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false"),
+]
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Pre-training by imitation: how well MCP's primitives follow reference motions.
 
-Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast`` from the generated corpus, in the
-character's ``PHASES``: the last step and settings of the task of each. Called again, the script resumes. It writes
-learning curves, returns with changing references, the tracking of every clip and films to ``benchmarks/results``, and
-with ``--publish`` the built-in networks to ``torchrl_mcp/networks``.
+Every character learns with ``method=mcp task=imitation stage=pretrain preset=fast width=1.0 action_std=0.1`` from the
+generated corpus, in the character's ``PHASES``: the last step and settings of the task of each. Called again, the
+script resumes. It writes learning curves, returns with changing references, the tracking of every clip and films to
+``benchmarks/results``, and with ``--publish`` the built-in networks to ``torchrl_mcp/networks``.
 """
 
 import argparse
@@ -46,7 +46,7 @@ PHASES: dict[str, list[tuple[int, dict[str, float]]]] = {
     ],
     "trex": [(4_096_000, ANY)],
 }
-COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast"]
+COMMON = ["method=mcp", "task=imitation", "stage=pretrain", "preset=fast", "width=1.0", "action_std=0.1"]
 MACHINE = ["logger=none", "torch_threads=1", "num_threads=1", "progress_bar=false", "checkpoint_interval=50"]
 EVALUATION_SEED = 12345
 CHANGES = {"to one of 16 moments": 16, "to any moment": 1}

@@ -87,7 +87,9 @@ def compare(character: str, precision: str, training: dict[str, int], repeats: i
     """Return the row of a character and a precision."""
     sizes = CHARACTERS[character]
     overrides = [f"training.{key}={value}" for key, value in training.items()]
-    cfg = build.compose_run("method=mcp", "stage=transfer", f"autocast={precision == 'bf16'}", "run_dir=.", *overrides)
+    cfg = build.compose_run(
+        "method=mcp", "stage=transfer", "width=1.0", f"autocast={precision == 'bf16'}", "run_dir=.", *overrides
+    )
     with TemporaryDirectory() as folder:
         trainers = {
             name: make_trainer(cfg, sizes, Path(folder), reuse=name == "reuse") for name in ("reuse", "no_reuse")

@@ -70,6 +70,7 @@ def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
         "training.minibatch_size": min(MINIBATCH, num_envs * STEPS),
         "training.num_epochs": EPOCHS,
         "training.total_frames": num_envs * STEPS * ITERATIONS,
+        "width": 1.0,
         "checkpoint_interval": 10**9,
         "autocast": choose("auto", "cpu").autocast,
         "num_threads": threads,

@@ -82,6 +82,8 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
         "task.directions.pretrain": [0, 0],  # +x, with the reward of Ant-v5
         "task.pretrain.max_episode_steps": 1000,
         "autocast": precision == "bf16",
+        "width": 1.0,
+        "learned_std": False,
         "optimizer.actor.lr": STEP_SIZE,
         "optimizer.critic.lr": STEP_SIZE,
         "optimizer.schedule": "null",

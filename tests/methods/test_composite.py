@@ -36,9 +36,9 @@ def test_what_a_composite_plays_in_one_state_varies_by_the_standard_deviation_as
     states = TensorDict(observation=torch.randn(64, 105), goal=torch.randn(64, 208), batch_size=64)
     with torch.no_grad():
         actions = actor.trained.get_dist(states).sample((2000,))
-    assert actions.var(0).mean().sqrt().item() == pytest.approx(cfg.character.action_std, rel=0.03)
+    assert actions.var(0).mean().sqrt().item() == pytest.approx(cfg.action_std, rel=0.03)
     loc, _ = parts["primitives"](states["observation"])
-    assert loc.std(-2).mean() > 0.3 * cfg.character.action_std  # they differ, so that the gate has a choice
+    assert loc.std(-2).mean() > 0.3 * cfg.action_std  # they differ, so that the gate has a choice
 
 
 @pytest.mark.parametrize("mixer", MIXERS)

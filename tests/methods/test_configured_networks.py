@@ -8,6 +8,8 @@ from torch import nn
 
 from torchrl_mcp.modules.primitives import BatchedLinear
 
+APPENDIX_E = ("width=1.0", "learned_std=false")  # the default preset has half the width and learned noise
+
 
 def configure(*overrides):
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
@@ -49,7 +51,7 @@ def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_fo
 )
 def test_the_configuration_builds_appendix_e_for_the_biped(method, stage, parameters):
     task, goal_dim = {"pretrain": ("imitation", 208), "transfer": ("heading", 2)}[stage]
-    cfg = configure(f"method={method}", f"stage={stage}", f"task={task}", "character=biped")
+    cfg = configure(f"method={method}", f"stage={stage}", f"task={task}", "character=biped", *APPENDIX_E)
     parts = instantiate(cfg.parts)(105, goal_dim, 17)
     instantiate(cfg.critic)(parts, 105, goal_dim)
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
@@ -71,7 +73,7 @@ COUNTS = {
 
 @pytest.mark.parametrize(("method", "stage"), COUNTS)
 def test_parameters_are_as_many_as_the_paper_s_layers_have(method, stage):
-    cfg = configure(f"method={method}", f"stage={stage}", "character=biped", "task=heading")
+    cfg = configure(f"method={method}", f"stage={stage}", "character=biped", "task=heading", *APPENDIX_E)
     parts = instantiate(cfg.parts)(105, 2, 17)
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert {name: count for name, count in counts.items() if count} == COUNTS[method, stage]

@@ -2,6 +2,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.runs import build, builtin, experiment, policies
@@ -63,6 +64,17 @@ def test_primitives_are_transferred_from_what_comes_with_the_library(run, publis
         assert torch.equal(parameter, original.parts["primitives"].state_dict()[name].bfloat16().float())
 
 
+def test_loaded_networks_keep_their_width_and_new_ones_have_the_runs(run, published, tmp_path):
+    transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", f"pretrained={published}"]
+    folder = experiment.train(configure(tmp_path / "gate", *transfer, "width=0.125", "training.total_frames=128"))
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
+    _, original, _ = policies.restore(run, num_envs=1, seed=0)
+    hidden = {name: first_layer(agent.parts[name]) for name in ("primitives", "gating")}
+    assert hidden == {"primitives": first_layer(original.parts["primitives"]), "gating": 64}  # an eighth of 512
+    longer = configure(tmp_path / "longer", *BIPED, "width=0.125", "training.total_frames=128", f"pretrained={run}")
+    assert experiment.run_config(experiment.train(longer)).width == 0.0625
+
+
 def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
     settings = [*BIPED, "motions=turning", "training.total_frames=128"]
     for origin, missing in ((checkpoint.find(run), set()), (published, {"critic"})):
@@ -74,6 +86,11 @@ def test_pre_training_goes_on_from_another_with_other_motions(run, published, tm
             assert parameters(agent.parts[name]) == parameters(other.parts[name])
     folder = experiment.train(cfg)
     assert checkpoint.find(folder).is_file()
+
+
+def first_layer(part):
+    """Units of the first layer."""
+    return next(layer.out_features for layer in part.modules() if isinstance(layer, nn.Linear))
 
 
 def parameters(part):

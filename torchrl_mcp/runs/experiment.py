@@ -69,16 +69,17 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
 
 
 def settled(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with the width of the kept networks: that of the pre-training that they come from.
+    """Return the configuration with the width of loaded networks: those that transfer keeps, else all of them.
 
     Raises:
         ValueError: If there is no such pre-training.
     """
-    path = _pretrained(cfg) if cfg.stage.name == "transfer" and cfg.pretrained else None
+    path = _pretrained(cfg) if cfg.pretrained else None
     if path is None:
         return cfg
     width = checkpoint.saved_config(path).get("width", 1.0)  # older networks have the paper's
-    return cast("DictConfig", OmegaConf.merge(cfg, {"kept_width": width}))
+    names = ("kept_width",) if cfg.stage.name == "transfer" else ("width", "kept_width")
+    return cast("DictConfig", OmegaConf.merge(cfg, dict.fromkeys(names, width)))
 
 
 def run_config(folder: Path) -> DictConfig:
