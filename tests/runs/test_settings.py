@@ -38,6 +38,15 @@ def test_every_preset_is_valid(preset):
         build.require_valid(composed(*place(method, task), f"preset={preset}"))
 
 
+def test_settings_of_a_method_hold_in_the_stage_that_they_name():
+    pretrain, transfer = (composed(*place("moe", task)) for task in ("imitation", "heading"))
+    assert (pretrain.optimizer.actor.lr, pretrain.optimizer.schedule.target_kl) == (6e-5, 0.2)
+    assert composed(*place("mcp", "imitation")).optimizer.schedule.target_kl == 0.05
+    assert pretrain.action_std == 0.05
+    assert transfer.optimizer.actor.lr == composed(*place("mcp", "heading")).optimizer.actor.lr
+    assert transfer.action_std == transfer.character.action_std
+
+
 WRONG = {
     "seed": ["null", "-1", "1.5", "many", str(2**32)],
     "training.num_envs": ["0", "1.5", "null", "-4", "[1]"],
