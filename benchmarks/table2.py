@@ -32,11 +32,21 @@ from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, NORMALI
 
 RESULTS = Path(__file__).resolve().parent / "results" / "table2"
 ARCHIVE = "runs.tar.xz"
-COLUMNS = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
+CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
 """Columns of metrics in the archive: those of learning curves and wall times."""
 
 EMPTY = ""
 """A cell of Table 2 without runs, or without a number in the paper."""
+
+
+def title(method: str) -> str:
+    """Return the heading of a method's column."""
+    return {"mcp": "MCP", "moe": "MOE"}.get(method, method.replace("_", " ").capitalize())
+
+
+SHORT = "Scratch, short"
+COLUMNS = ("Scratch", SHORT, *map(title, METHODS[1:]))
+"""Columns of Table 2."""
 
 
 def main() -> None:
@@ -73,10 +83,10 @@ def pack(root: Path, archive: Path) -> None:
 
 
 def curve(metrics: Path) -> str:
-    """Return the metrics of a run with only the ``COLUMNS``."""
+    """Return the metrics of a run with the columns of ``CURVE`` alone."""
     kept = io.StringIO()
     with metrics.open(newline="") as file:
-        writer = csv.DictWriter(kept, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer = csv.DictWriter(kept, CURVE, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(csv.DictReader(file))
     return kept.getvalue()
@@ -99,35 +109,28 @@ def write_results(found: Sequence[Cell], output: Path) -> None:
 def table_2(found: Sequence[Cell]) -> list[dict[str, Any]]:
     """Return the rows of Table 2: ours with the number of seeds, and the paper's below.
 
-    Scratch has two columns: with the steps of the other methods' two stages together, and with those of transfer alone.
+    Scratch has two columns: with more steps than the other methods' transfer, and with as many. Of several cells of a
+    method, such as two kinds of exploration, the best is in the table.
     """
     table = []
     for place in PLACES:
         here = [cell for cell in found if cell.place == place and cell.stage == "transfer" and cell.is_standard]
-        ours: dict[str, Any] = {"": f"{place[0]}, {CHARACTERS[place[1]]}"}
-        paper: dict[str, Any] = {"": "*paper*"}
-        for name in METHODS:
-            mine = sorted((cell for cell in here if cell.method == name), key=lambda cell: -cell.complete[0].frames)
-            reported = TABLE_2.get((*place, name))
-            short = mine[1:] if name == "scratch" else []
-            ours[title(name)] = score(mine[0]) if mine else EMPTY
-            paper[title(name)] = f"*{reported.mean:.3f}*" if reported else EMPTY
-            if name == "scratch":
-                ours["Scratch, short"], paper["Scratch, short"] = score(short[0]) if short else EMPTY, EMPTY
-        table += [ours, paper]
+        transfer = max((cell.complete[0].frames for cell in here if cell.method != "scratch"), default=0)
+        best: dict[str, Cell] = {}
+        for cell in here:
+            column = title(cell.method)
+            if cell.method == "scratch" and cell.complete[0].frames <= transfer:
+                column = SHORT
+            best[column] = max(best.get(column, cell), cell, key=lambda cell: average(cell.returns()))
+        paper = {title(name): TABLE_2[*place, name].mean for name in METHODS if (*place, name) in TABLE_2}
+        table.append({"": f"{place[0]}, {CHARACTERS[place[1]]}"} | {name: score(best.get(name)) for name in COLUMNS})
+        table.append({"": "*paper*"} | {name: f"*{paper[name]:.3f}*" if name in paper else EMPTY for name in COLUMNS})
     return table
 
 
-def title(method: str) -> str:
-    """Return the heading of a method's column."""
-    return {"mcp": "MCP", "moe": "MOE"}.get(method, method.replace("_", " ").capitalize())
-
-
-def score(cell: Cell) -> str:
+def score(cell: Cell | None) -> str:
     """Return a cell of Table 2: the mean deterministic return, and the number of seeds."""
-    mean = cell.mean()
-    assert mean is not None
-    return f"{mean.value:.3f} ({len(cell.complete)})"
+    return f"{average(cell.returns()):.3f} ({len(cell.complete)})" if cell else EMPTY
 
 
 def label(cell: Cell) -> str:

@@ -5,8 +5,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parents[1] / "networks"
 
 PREFIX = "builtin:"
-"""Prefix of the names of built-in networks on a command line, before METHOD-CHARACTER-TASK, as their files are named;
-MCP's have no METHOD."""
+"""Prefix of the names of built-in networks on a command line, before the character."""
 
 
 def builtin(method: str, character: str, task: str | None = None) -> Path:
@@ -31,23 +30,21 @@ def has_task(path: Path) -> bool:
 
 
 def names() -> list[str]:
-    """Return the names of the built-in networks on a command line."""
-    return sorted(f"{PREFIX}{path.stem.removeprefix('mcp-')}" for path in FOLDER.glob("*.torchrl"))
+    """Return the names of MCP's built-in networks on a command line."""
+    return sorted(f"{PREFIX}{path.stem.removeprefix('mcp-')}" for path in FOLDER.glob("mcp-*.torchrl"))
 
 
 def locate(checkpoint: str) -> Path:
     """Return the run folder or checkpoint file that a command line names.
 
     Args:
-        checkpoint: A path, ``builtin:CHARACTER`` or ``builtin:CHARACTER-TASK``, for another method than MCP
-            ``builtin:METHOD-CHARACTER``.
+        checkpoint: A path, ``builtin:CHARACTER`` or ``builtin:CHARACTER-TASK``.
 
     Raises:
         ValueError: If there is no such built-in network or file.
     """
     if checkpoint in names():
-        name = checkpoint.removeprefix(PREFIX)
-        return next(path for path in (FOLDER / f"{name}.torchrl", FOLDER / f"mcp-{name}.torchrl") if path.is_file())
+        return FOLDER / f"mcp-{checkpoint.removeprefix(PREFIX)}.torchrl"
     if checkpoint.startswith(PREFIX):
         raise ValueError(f"no {checkpoint} comes with the library: give one of {', '.join(names())}")
     if not Path(checkpoint).exists():
