@@ -1,5 +1,6 @@
 """The policy network of the scratch model."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -53,6 +54,14 @@ class GaussianPolicy(nn.Module):
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``(*B, A)``, from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         return self.scale(self.output(self.body(observation, goal)))
+
+
+@torch.no_grad()
+def restart_noise(network: nn.Module, std: float) -> None:
+    """Set the standard deviations of all policies in a network whose noise is the same in all states."""
+    for module in network.modules():
+        if isinstance(module, AddStateIndependentNormalScale):
+            module.state_independent_scale.fill_(math.log(std))
 
 
 def state_independent_scale(

@@ -29,6 +29,7 @@ from torchrl_mcp.envs.engines import require_engine
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import settings
 from torchrl_mcp.runs.trust import require_trusted, targets
 from torchrl_mcp.training import checkpoint
@@ -164,6 +165,8 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
         if pretrained is not None and cfg.transfer.keep:
             checkpoint.load_parts(parts, cfg.transfer.keep, pretrained)
+            if cfg.transfer.get("restart_noise"):
+                restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze
     frozen = FrozenParts(parts, names)
     actor = instantiate(cfg.actor)(parts, frozen=names)

@@ -85,7 +85,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind regret_per_step staggered
+        terminate_when_unhealthy success_reward parts.blind regret_per_step staggered restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects object_distances
