@@ -3,6 +3,7 @@ import torch
 from torch import nn
 
 from torchrl_mcp.modules import GaussianPolicy, InjectedPolicy
+from torchrl_mcp.modules.gaussian import restart_noise
 
 
 @pytest.mark.parametrize(
@@ -60,3 +61,15 @@ def test_a_standard_deviation_that_learns_shrinks_where_noise_costs_reward(netwo
 def test_an_impossible_standard_deviation_is_refused(std):
     with pytest.raises(ValueError, match="std must be one positive number or 3"):
         GaussianPolicy(27, 2, 3, std=std)
+
+
+@pytest.mark.parametrize("learned", [True, False])
+def test_noise_that_begins_anew_has_the_standard_deviation_given_and_the_same_mean(learned):
+    policy = GaussianPolicy(5, 2, 3, std=0.02, learned_std=learned)
+    inputs = torch.randn(10, 5), torch.randn(10, 2)
+    before, _ = policy(*inputs)
+    restart_noise(nn.ModuleDict({"policy": policy, "other": nn.Linear(2, 2)}), 0.1)
+    loc, scale = policy(*inputs)
+    assert torch.equal(loc, before)
+    torch.testing.assert_close(scale, torch.full((10, 3), 0.1))
+    assert scale.requires_grad == learned
