@@ -131,6 +131,16 @@ def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 11_000_000)
 
 
+def test_pretraining_ignores_how_much_the_gate_of_transfer_explores(tmp_path):
+    arguments = ["task=heading", "character=biped", "method=mcp", "seed=0", "exploration=weights"]
+    source, transfer = jobs_of(
+        "benchmark=table2", f"run_root={tmp_path}", *arguments, "exploration.actor.logits_std=0.5"
+    )
+    assert source.config["exploration"]["name"] == "action"
+    assert transfer.config["exploration"]["actor"]["logits_std"] == 0.5
+    assert transfer.needs == source.folder
+
+
 def test_a_longer_transfer_shares_the_pretraining_of_a_shorter_one(tmp_path):
     def jobs(*budget):
         arguments = ["task=dribble", "character=biped", "method=mcp", "preset=comparison", "seed=0", *budget]

@@ -28,7 +28,7 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences
+from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.training.run_folder import CONFIG, LOG
 
@@ -149,7 +149,8 @@ def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None
     kept = {
         key: value
         for key, value in settings.items()
-        if key not in TRANSFER_ONLY and (name == task["name"] or not key.lstrip("+").startswith("task."))
+        if not is_among(key.lstrip("+"), TRANSFER_ONLY)
+        and (name == task["name"] or not key.lstrip("+").startswith("task."))
     }
     return {**kept, "task": name, "stage": "pretrain"} | ({} if seed is None else {"seed": str(seed)})
 
