@@ -75,5 +75,5 @@ def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
     }
     assert cfg.optimizer.schedule.target_kl == 0.02
     imitation = composed("task=imitation")
-    assert (imitation.training.total_frames, imitation.optimizer.schedule.target_kl) == (12_000_000, 0.05)
+    assert (imitation.training.total_frames, imitation.optimizer.schedule.target_kl) == (10_000_000, 0.05)
     assert (composed().training.num_envs, composed().training.minibatch_size) == (64, 512)
