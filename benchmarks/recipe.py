@@ -32,7 +32,7 @@ ELSEWHERE = (
         "run_dir=",
     ),
     *("run_root=", "checkpoint_interval=", "keep_checkpoints=", "logger=", "torch_threads=", "num_threads="),
-    *("progress_bar=", "evaluation."),
+    *("progress_bar=", "evaluation.", "pretrained="),
 )
 """Beginnings of arguments that have a column of their own, or only say where and how a run was made."""
 
