@@ -58,7 +58,12 @@ class GaussianPolicy(nn.Module):
 
 @torch.no_grad()
 def restart_noise(network: nn.Module, std: float) -> None:
-    """Set the standard deviations of all policies in a network whose noise is the same in all states."""
+    """Set the standard deviations of all policies in a network whose noise is the same in all states.
+
+    Args:
+        network: The network; other modules in it stay as they are.
+        std: Standard deviation of all actions, in action units.
+    """
     for module in network.modules():
         if isinstance(module, AddStateIndependentNormalScale):
             module.state_independent_scale.fill_(math.log(std))
