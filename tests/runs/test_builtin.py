@@ -1,11 +1,12 @@
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build, builtin, experiment, policies
+from torchrl_mcp.runs import build, builtin, experiment, policies, publish
 from torchrl_mcp.training import checkpoint
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -47,6 +48,19 @@ def act(path):
 def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16(run, published):
     torch.testing.assert_close(act(published), act(run), atol=0.02, rtol=0)
     assert (act(published) != act(run)).any()
+
+
+def test_the_values_that_choose_options_are_published_and_needed(tmp_path):
+    run = experiment.train(configure(tmp_path / "run", "method=option_critic", *BIPED[1:]))
+    policies.publish_run(run, tmp_path / "with.torchrl")
+    _, agent, _ = policies.restore(tmp_path / "with.torchrl", num_envs=1, seed=0)
+    cfg, original, _ = policies.restore(run, num_envs=1, seed=0)
+    for name, parameter in original.parts["critic"].state_dict().items():
+        assert torch.equal(agent.parts["critic"].state_dict()[name], parameter.bfloat16().float())
+    del original.parts["critic"]
+    publish.publish(original.parts, OmegaConf.to_container(cfg), tmp_path / "without.torchrl", shared={})
+    with pytest.raises(ValueError, match="critic"):
+        policies.restore(tmp_path / "without.torchrl", num_envs=1, seed=0)
 
 
 def test_a_published_policy_is_a_small_part_of_the_checkpoint_and_names_no_folder(run, published):

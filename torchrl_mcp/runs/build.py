@@ -48,6 +48,12 @@ class Agent:
     critic: TensorDictModuleBase
     frozen: FrozenParts
 
+    @property
+    def spare_parts(self) -> set[str]:
+        """Names of the parts that act in no state: the critic, unless its values choose the option."""
+        acting = {id(parameter) for parameter in self.actor.policy.parameters()}
+        return {"critic"} if acting.isdisjoint(map(id, self.parts["critic"].parameters())) else set()
+
 
 def require_valid(cfg: DictConfig) -> None:
     """Check the values of all settings.

@@ -41,8 +41,8 @@ def restore(
     """Return configuration, trained agent and new environments from a run folder or checkpoint file.
 
     Args:
-        path: Run folder, for its newest checkpoint, or checkpoint file. Published files have no critic; it is then
-            untrained.
+        path: Run folder, for its newest checkpoint, or checkpoint file. Published files have no critic that does
+            not act; it is then untrained.
         num_envs: Number of environments.
         seed: Seed of the environments.
         device: Device of the networks.
@@ -58,7 +58,7 @@ def restore(
     agent = make_agent(cfg, env)
     if checkpoint.shared(file):
         take_shared(agent.parts, file, builtin(cfg.method.name, cfg.character.name))
-    checkpoint.load_agent(agent.parts, file)
+    checkpoint.load_agent(agent.parts, file, optional=agent.spare_parts)
     return cfg, agent, env
 
 
@@ -76,7 +76,7 @@ def publish_run(path: Path, output: Path) -> None:
     """
     cfg, agent, _ = restore(path, num_envs=1, seed=0)
     cfg.run_dir = cfg.run_root = "runs"  # the run's folder is of no use to others
-    parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name != "critic"})
+    parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name not in agent.spare_parts})
     shared: dict[str, str] = {}
     if cfg.stage.name == "transfer" and cfg.pretrained == "builtin":
         shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))

@@ -76,16 +76,19 @@ def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None
     load(run_checkpoint(nn.ModuleDict({name: parts[name] for name in names})), path)
 
 
-def load_agent(parts: nn.ModuleDict, path: Path) -> None:
+def load_agent(parts: nn.ModuleDict, path: Path, optional: Collection[str] = ("critic",)) -> None:
     """Restore all parts of an agent from the checkpoint file ``path``.
 
-    The file may lack the critic and the parts that it declares as :func:`shared`.
+    Args:
+        parts: The agent's parts.
+        path: The file.
+        optional: Names of parts that the file may lack, besides those that it declares as :func:`shared`.
 
     Raises:
         ValueError: As :func:`load`.
     """
-    held, optional = _manifest(path)["components"], {"critic", *shared(path)}
-    load_parts(parts, [name for name in parts if name not in optional or _component(name) in held], path)
+    held, missing = _manifest(path)["components"], {*optional, *shared(path)}
+    load_parts(parts, [name for name in parts if name not in missing or _component(name) in held], path)
 
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
