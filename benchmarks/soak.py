@@ -32,8 +32,9 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import count, zip_longest
 from pathlib import Path
 from typing import Any
@@ -56,12 +57,11 @@ KILL = (60.0, 180.0)
 """Minimum and maximum seconds after which a run is killed."""
 
 
-def attempt(settings: list[str], disk: Disk, log: Path, patience: float) -> tuple[str, float]:
-    """Run training until it ends or is killed; return the cause, and the seconds until all its processes were gone."""
+def attempt(settings: list[str], disk: Disk, log: Path, due: Callable[[], bool]) -> tuple[str, float]:
+    """Run training until it ends, or is due to be killed; return how it ended, and the seconds until it was gone."""
     with log.open("wb") as file:
         process = subprocess.Popen([*TRAIN, *settings], stdout=file, stderr=file, start_new_session=True)
-    deadline = time.monotonic() + patience
-    while process.poll() is None and time.monotonic() < deadline:
+    while process.poll() is None and not due():
         disk.pass_time(process)
         time.sleep(0.1)
     killed = process.poll() is None
@@ -84,16 +84,25 @@ def _group(stat: Path) -> int:
     return 0
 
 
+def _past(deadline: float) -> bool:
+    return time.monotonic() >= deadline
+
+
+def _saved(folder: Path) -> bool:
+    return bool(run_folder.find_all(folder))
+
+
 def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: bool) -> dict[str, Any]:
     """Train, and resume after each interruption, until the run is complete."""
     ends: Counter[str] = Counter()
     slowest, changed, before, began = 0.0, 0, [], time.monotonic()
     while not ends["done"]:
         begun = (folder / run_folder.CONFIG).exists()
-        patience = random.uniform(*KILL)
-        if quick:  # once, early enough for a run of ten seconds
-            patience = math.inf if ends["killed"] else patience / 20
-        how, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, patience)
+        if quick:  # once, after its first checkpoint
+            due = (lambda: False) if ends["killed"] else partial(_saved, folder)
+        else:
+            due = partial(_past, time.monotonic() + random.uniform(*KILL))
+        how, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, due)
         if how not in ("killed", "disk_full", "done"):
             print(log.read_text(errors="replace")[-3000:], flush=True)
         ends[how] += 1
