@@ -1,5 +1,7 @@
 """Mirror images in learning: they agree with samples, a symmetric policy pays nothing, what has none is refused."""
 
+import math
+
 import pytest
 import torch
 from hydra import compose, initialize_config_module
@@ -40,6 +42,7 @@ def collect(agent, trainer):
 def test_half_of_the_samples_are_mirror_images_to_learn_from_like_the_others(overrides, tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=augment", *overrides)
     assert isinstance(trainer.advantages, MirroredSamples)
+    trainer.advantages.tolerance = math.inf
     before = collect(agent, trainer)
     after = trainer.advantages(before.clone())
     plain = trainer.advantages.advantages(before.clone())
@@ -61,6 +64,23 @@ def test_half_of_the_samples_are_mirror_images_to_learn_from_like_the_others(ove
     acted = agent.actor.policy(after.select("observation", "goal"))
     for key in set(agent.actor.stored) - set(agent.actor.drawn):
         torch.testing.assert_close(after[key], acted[key], atol=1e-5, rtol=1e-4)
+
+
+def test_a_sample_whose_image_the_policy_finds_all_but_impossible_is_not_replaced(tmp_path):
+    agent, trainer = trainer_of(tmp_path, "symmetry=augment", "method=scratch", "task=heading")
+    before = collect(agent, trainer)
+    actor, mirrors = agent.actor, trainer.source.env.mirrors()
+    image = before.clone()
+    for key in ("observation", "goal", "action"):
+        image[key] = mirrors[key](image[key])
+    loss = before[actor.log_prob] - actor.trained.get_dist(image).log_prob(image["action"])
+    trainer.advantages.tolerance = limit = loss.median().item()
+    after = trainer.advantages(before.clone())
+    mirrored = (after["action"] != before["action"]).any(-1)
+    assert mirrored.any()
+    assert (loss[mirrored] <= limit).all()
+    assert (loss > limit).any()
+    torch.testing.assert_close(after[actor.log_prob][~mirrored], before[actor.log_prob][~mirrored])
 
 
 @pytest.mark.parametrize("overrides", MIRRORED.values(), ids=MIRRORED)

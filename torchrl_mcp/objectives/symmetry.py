@@ -17,10 +17,14 @@ class MirroredSamples:
     The mirror image of a sample has the mirrored state, goal and action, and the same advantage. Its log-probability is
     computed with the current policy, so that the first ratio of PPO is one. The number of samples stays the same.
 
+    A policy that is not symmetric may find an image all but impossible. The gradient of its log-probability is then so
+    large that learning diverges, so such a sample is not replaced.
+
     Args:
         advantages: Estimates advantages of trajectories ``(N, T)``.
         actor: The actor.
         mirrors: Reflections of ``observation``, ``goal`` and ``action``.
+        tolerance: Largest difference between the log-probabilities of a sample and of its image, in nats.
 
     Raises:
         ValueError: If the actor explores over something that has no mirror image.
@@ -30,9 +34,11 @@ class MirroredSamples:
         https://doi.org/10.1145/3359566.3360070
     """
 
-    def __init__(self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module]) -> None:
+    def __init__(
+        self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module], *, tolerance: float = 20.0
+    ) -> None:
         _require_actions(actor)
-        self.advantages, self.actor, self.mirrors = advantages, actor, mirrors
+        self.advantages, self.actor, self.mirrors, self.tolerance = advantages, actor, mirrors, tolerance
         self.out_keys = advantages.out_keys
 
     @torch.no_grad()
@@ -47,8 +53,11 @@ class MirroredSamples:
         for key in self.actor.stored:
             if key not in self.actor.drawn:
                 image[key] = acted[key]
+        before = image[self.actor.log_prob]
         image[self.actor.log_prob] = self.actor.trained.get_dist(image).log_prob(image["action"])
-        samples[chosen] = image
+        likely = before - image[self.actor.log_prob] <= self.tolerance
+        chosen[chosen.clone()] = likely
+        samples[chosen] = image[likely]
         return samples
 
 
