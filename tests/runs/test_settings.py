@@ -45,6 +45,8 @@ def test_settings_of_a_method_hold_in_the_stage_that_they_name():
     assert pretrain.action_std == 0.05
     assert transfer.optimizer.actor.lr == composed(*place("mcp", "heading")).optimizer.actor.lr
     assert transfer.action_std == transfer.character.action_std
+    assert composed(*place("finetune", "heading")).action_std == 0.1
+    assert composed(*place("finetune", "dribble")).action_std == 0.05
     gate = composed(*place("hierarchical", "dribble"))
     assert (gate.training.minibatch_size, gate.optimizer.schedule.max_lr) == (64, 2e-3)
     assert composed(*place("scratch", "dribble")).training.minibatch_size == 512
