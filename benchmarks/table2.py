@@ -129,8 +129,11 @@ def table_2(found: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def score(cell: Cell | None) -> str:
-    """Return a cell of Table 2: the mean deterministic return, and the number of seeds."""
-    return f"{average(cell.returns()):.3f} ({len(cell.complete)})" if cell else EMPTY
+    """Return a cell of Table 2: the mean deterministic return, the share of successes, and the number of seeds."""
+    if cell is None:
+        return EMPTY
+    success = f", {cell.metrics['success']:.0%}" if "success" in cell.metrics else ""
+    return f"{average(cell.returns()):.3f}{success} ({len(cell.complete)})"
 
 
 def label(cell: Cell) -> str:
