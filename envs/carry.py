@@ -38,8 +38,8 @@ class Carry(Transport):
     The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
     to the carrier. The joint opens once the box is over the target, less than 6 cm above it, and does not close again
     within the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest
-    point is less than 1 cm above it. A box that was knocked off the source cannot be taken. ``success`` means that the
-    box was taken, is no longer held, and stands on the target.
+    point is less than 1 cm above it. A box that was knocked off the source cannot be taken. ``box_taken`` (1, bool) is
+    whether the box was taken in this episode, and ``success`` whether it then was let go and stands on the target.
 
     ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
     angular velocity of the box. A table's position is the middle of its top. See
@@ -115,6 +115,9 @@ class Carry(Transport):
 
     def _begin(self, ids: Tensor) -> dict[str, Tensor]:
         return {**super()._begin(ids), "taken": torch.zeros_like(self.episode["taken"][ids])}
+
+    def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        return {**super()._show(ids), "box_taken": self.episode["taken"][ids].bool().unsqueeze(-1)}
 
     def _rewards(self) -> Tensor:
         rewards = super()._rewards()

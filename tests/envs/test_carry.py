@@ -53,8 +53,9 @@ def force_on_the_ground(env, index=0):
 @pytest.mark.parametrize(("gap", "taken"), [(-0.002, 1.0), (0.002, 0.0)])
 def test_the_torso_takes_the_box_by_touching_it(gap, taken, ahead):
     env = make()
-    play(env, env.reset(ahead(env, gap), set_state=True), 1)
+    carrier = play(env, env.reset(ahead(env, gap), set_state=True), 1)
     assert joined(env) == [taken] * 2
+    assert carrier["box_taken"].flatten().tolist() == [bool(taken)] * 2
 
 
 @pytest.mark.parametrize("character", CHARACTERS)
