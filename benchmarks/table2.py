@@ -6,8 +6,8 @@
 
 Everything lands in ``results/table2``. ``runs.tar.xz`` has the run folders without checkpoints, and of their metrics
 only the columns of learning curves; ``torchrl-mcp-report`` reads it unpacked. ``table.md`` is Table 2 with our results.
-Each row has a table, ``TASK_CHARACTER.md``, and learning curves; ``imitation_CHARACTER`` has those of pre-training.
-``runs.csv`` has the command, the commit and the machine of every run.
+Each row has a table, ``TASK_CHARACTER.md``, and learning curves; ``imitation_CHARACTER`` and ``holdout_ant_pretrain``
+have those of pre-training. ``runs.csv`` has the command, the commit and the machine of every run.
 """
 
 import argparse
@@ -97,9 +97,10 @@ def write_results(found: Sequence[Cell], output: Path) -> None:
     table = text_table(table_2(found), markdown=True)
     (output / "table.md").write_text(table + "\n")
     print(table)
-    for place in dict.fromkeys(cell.place for cell in found):
-        here = [cell for cell in found if cell.place == place]
-        stem = output / "_".join(place)
+    for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
+        here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
+        twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
+        stem = output / "_".join([*place, stage] if twice else place)
         stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
         curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in here})
         save_figure(draw_curves(curves), stem)
