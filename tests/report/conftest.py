@@ -43,6 +43,7 @@ def write(
     preset="fast",
     diagnostics=(),
     episodes=128,
+    environment=None,
     **settings,
 ):
     folder = root / name
@@ -64,7 +65,8 @@ def write(
     if score is not None:
         modes = {"deterministic": score, "stochastic": score - 0.1}
         found = {mode: numbers(value, dict(diagnostics)) for mode, value in modes.items()}
-        (folder / "evaluation.json").write_text(json.dumps({"episodes": episodes, "seed": 12345, **found}))
+        protocol = {"episodes": episodes, "seed": 12345, "environment": environment or {}}
+        (folder / "evaluation.json").write_text(json.dumps(protocol | found))
     return folder
 
 

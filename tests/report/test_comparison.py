@@ -141,10 +141,31 @@ def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_r
     ]
 
 
+def test_evaluations_in_different_tasks_are_remarked(write_run):
+    environments = [{"speed": 1.0, "success_reward": rewarded} for rewarded in (False, True)]
+    (cell,) = grouped(*(write_run(str(i), seed=i, score=0.5, environment=use) for i, use in enumerate(environments)))
+    told = (
+        "evaluations: 128 episodes of seed 12345 with success_reward=False, "
+        "128 episodes of seed 12345 with success_reward=True"
+    )
+    assert cell.remarks == [f"mixed {told}"]
+    assert caveats([cell]) == [told]
+
+
+def test_a_method_s_own_settings_are_standard_in_both_stages(write_mcp):
+    transferred, eight, sixteen = grouped(
+        write_mcp("a", stage="pretrain", task="imitation"),
+        write_mcp("b", stage="pretrain", task="imitation", num_primitives=16),
+        write_mcp("c", pretrained="a"),
+    )
+    assert [cell.is_standard for cell in (transferred, eight, sixteen)] == [True, True, False]
+
+
 def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     evaluated = {"speed": 1.0, "initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "shaping": {}}
+    evaluated["emphasis"] = None
     trained = {**evaluated, "speed": 1.0, "initial_states": {"rest": 0.2, "motions": 0.8}, "mixture": [{"weight": 2}]}
-    trained["shaping"] = {"object": {"slope": 1.0}}
+    trained |= {"shaping": {"object": {"slope": 1.0}}, "emphasis": {"discount": 0.9}}
     runs = {"plain": evaluated, "practised": trained}
     plain, practised = grouped(
         *(
@@ -157,7 +178,7 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
         "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, "
-        "mixture=[{'weight': 2}], shaping.object.slope=1.0"
+        "mixture=[{'weight': 2}], shaping.object.slope=1.0, emphasis.discount=0.9"
     )
 
 

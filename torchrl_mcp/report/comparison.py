@@ -52,7 +52,10 @@ class Cell:
     @property
     def is_standard(self) -> bool:
         """Whether the settings are the method's standard ones, so that the cell is no variant."""
-        return all(self.choices[name] == value for name, value in self.runs[0].standard.items())
+        standard = self.runs[0].standard
+        if self.stage == "pretrain":
+            standard.pop("trained", None)  # a choice of transfer: pre-training trains all parts
+        return all(self.choices[name] == value for name, value in standard.items())
 
     @property
     def reported(self) -> Reported | None:
@@ -129,7 +132,7 @@ class Cell:
             *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
             *(["one seed: the interval is over its episodes"] if len(self.complete) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
-            *(f"mixed {found}" for found in _mixed("evaluations", map(_protocol, self.complete))),
+            *(f"mixed {found}" for found in _mixed("evaluations", _protocols(self.complete))),
             *(f"trained with practice={self.choices['practice']}: {used}" for used in self.runs[0].practice),
         ]
 
@@ -212,7 +215,7 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
     return [
         *_mixed("presets", (run.preset for run in runs)),
         *_mixed("commits", (run.commit for run in runs)),
-        *_mixed("evaluations", (_protocol(run) for run in runs if run.state == "complete")),
+        *_mixed("evaluations", _protocols([run for run in runs if run.state == "complete"])),
         *(
             f"numbers of steps of {title}: {', '.join(f'{total:,}' for total in totals)}"
             for title, totals in steps.items()
@@ -299,9 +302,15 @@ def _seeds(seeds: Iterable[int]) -> str:
     return f"seed{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
 
 
-def _protocol(run: Run) -> str:
-    numbers = run.evaluation
-    return f"{numbers.get('episodes', 'unknown')} episodes of seed {numbers.get('seed', 'unknown')}"
+def _protocols(runs: Sequence[Run]) -> list[str]:
+    """How each run was evaluated: its episodes, and settings of the environment that differ from those of other runs."""
+    environments = [run.evaluation.get("environment", {}) for run in runs]
+    telling = _varying(environments)
+    return [
+        f"{run.evaluation.get('episodes', 'unknown')} episodes of seed {run.evaluation.get('seed', 'unknown')}"
+        + "".join(f" with {name}={environment[name]}" for name in telling)
+        for run, environment in zip(runs, environments, strict=True)
+    ]
 
 
 def _mixed(name: str, values: Iterable[str]) -> list[str]:
