@@ -115,6 +115,15 @@ def step_size(trainer, name):
     return max(gone)
 
 
+def test_what_one_optimiser_trains_the_other_s_loss_does_not_read(built):
+    """They learn at the same time."""
+    *_, trainer = built
+    for name, other in (("actor", "critic"), ("critic", "actor")):
+        groups = trainer.optimizers[name].param_groups if name in trainer.optimizers else ()
+        trained = {parameter for group in groups for parameter in group["params"]}
+        assert trained.isdisjoint(trainer.losses[other].parameters())
+
+
 def decays(trainer):
     estimator = getattr(trainer.advantages, "gae", trainer.advantages)
     return float(estimator.lmbda), float(estimator.gamma)

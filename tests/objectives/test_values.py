@@ -1,7 +1,12 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
 from torchrl.modules import IndependentNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
@@ -40,7 +45,7 @@ def test_it_is_the_critic_s_term_of_torchrl_s_loss_to_value_and_gradient():
 
 def test_of_options_only_the_value_of_the_one_that_acted_is_judged():
     values = nn.Embedding(2, 3, _weight=torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
-    critic = TensorDictModule(values, ["observation"], ["option_values"])
+    critic = TensorDictSequential(TensorDictModule(values, ["observation"], ["option_values"]))
     data = TensorDict(
         observation=torch.tensor([0, 1]),
         option=torch.tensor([2, 0]),

@@ -207,9 +207,11 @@ def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all
     assert threads == {"step": {1}, "update": {2}}
 
 
-@pytest.mark.parametrize("method", ["mcp", "option_critic"])
-def test_actor_and_critic_learn_the_same_at_the_same_time_as_in_turn_to_the_bit(tmp_path, monkeypatch, method):
-    settings = [f"method={method}", "torch_threads=2", "training.total_frames=256"]
+@pytest.mark.parametrize(("method", "autocast"), [("mcp", False), ("option_critic", False), ("option_critic", True)])
+def test_actor_and_critic_learn_the_same_at_the_same_time_as_in_turn_to_the_bit(
+    tmp_path, monkeypatch, method, autocast
+):
+    settings = [f"method={method}", f"autocast={autocast}", "torch_threads=2", "training.total_frames=256"]
     with threads(2):
         experiment.train(configure(tmp_path / "together", *settings))
         with monkeypatch.context() as patch:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
@@ -102,10 +102,15 @@ class OptionValueLoss(ValueLoss):
 
     .. math:: L = c \, \mathbb{E} (Q_\Omega(s, \omega) - y)^2
 
+    Of the critic it evaluates what the values need: terminations are the actor's, which may learn at the same time.
+
     Args:
         critic_network: From ``observation`` and ``goal`` to ``option_values``.
         coeff: Weight of the error, :math:`c`.
     """
+
+    def __init__(self, critic_network: TensorDictSequential, *, coeff: float) -> None:
+        super().__init__(critic_network.select_subsequence(out_keys=["option_values"]), coeff=coeff)
 
     def _values(self, samples: TensorDictBase) -> Tensor:
         values = self.critic_network(samples.select(*self.critic_network.in_keys))["option_values"]
