@@ -112,6 +112,8 @@ class Transport(TransferTask):
             raise ValueError(
                 "emphasis with discount=1: a success is worth full reward for ever, pass a discount below 1"
             )
+        if emphasis is not None and kwargs.get("shaping"):
+            raise ValueError("emphasis with shaping: both reward progress in training, pass one of them")
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
         self._emphasised, self._idle, self._full = None, 0.0, 1.0
         if emphasis is not None:

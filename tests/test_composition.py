@@ -63,6 +63,13 @@ def test_a_character_that_is_asked_for_wins(character):
     assert composed("task=heading", "method=moe", f"character={character}").character.name == character
 
 
+@pytest.mark.parametrize("preset", ["fast", "paper"])
+def test_an_optimiser_without_a_schedule_has_none_with_any_preset(preset):
+    cfg = composed("task=heading", f"preset={preset}", "optimizer=sgd")
+    assert cfg.optimizer.schedule is None
+    assert cfg.optimizer.actor._target_ == "torch.optim.SGD"
+
+
 def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
     cfg = composed("task=heading", "task.name=juggle")
     assert dict(cfg.training) == {

@@ -135,6 +135,21 @@ def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path
         assert torch.equal(before[name], after[name]) == (kept or constant), name
 
 
+def test_a_transfer_of_a_transfer_keeps_the_width_of_the_primitives(tmp_path, pretrained):
+    """Its own networks have another."""
+    once = configure(tmp_path / "once", "stage=transfer", f"pretrained={pretrained}", "width=0.125")
+    twice = configure(tmp_path / "twice", "stage=transfer", f"pretrained={experiment.train(once)}", "width=0.03")
+    again = configure(tmp_path / "again", f"pretrained={experiment.train(twice)}")
+    for run in (tmp_path / "twice", experiment.train(again)):
+        assert layers(run, "primitives") == layers(pretrained, "primitives")
+        assert layers(run, "gating") == layers(tmp_path / "twice", "gating")
+    assert layers(tmp_path / "once", "gating") != layers(tmp_path / "twice", "gating")
+
+
+def layers(run, part):
+    return {name: value.shape for name, value in final_parts(run).items() if name.startswith(f"{part}.")}
+
+
 def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, pretrained):
     settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]"]
     start = build.make_agent(

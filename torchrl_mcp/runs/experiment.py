@@ -69,7 +69,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
 
 
 def settled(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with the width of loaded networks: those that transfer keeps, else all of them.
+    """Return the configuration with the widths of loaded networks: of those that transfer keeps, else of all.
 
     Raises:
         ValueError: If there is no such pre-training.
@@ -77,9 +77,12 @@ def settled(cfg: DictConfig) -> DictConfig:
     path = _pretrained(cfg) if cfg.pretrained else None
     if path is None:
         return cfg
-    width = checkpoint.saved_config(path).get("width", 1.0)  # older networks have the paper's
-    names = ("kept_width",) if cfg.stage.name == "transfer" else ("width", "kept_width")
-    return cast("DictConfig", OmegaConf.merge(cfg, dict.fromkeys(names, width)))
+    saved = checkpoint.saved_config(path)
+    width = saved.get("width", 1.0)  # older networks have the paper's
+    widths = {"width": width, "kept_width": saved.get("kept_width", width)}
+    if cfg.stage.name == "transfer":
+        del widths["width"]
+    return cast("DictConfig", OmegaConf.merge(cfg, widths))
 
 
 def run_config(folder: Path) -> DictConfig:
