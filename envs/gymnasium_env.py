@@ -34,10 +34,11 @@ class GymnasiumEnv(gymnasium.Env):
         {'observation': (105,), 'goal': (2,)}
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, task: type[CharacterEnv], *, render_mode: str | None = None, **kwargs: Any) -> None:
         self.env = task(num_envs=1, num_threads=1, **kwargs)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.env.control_timestep)}
         self.render_mode = render_mode
         spec = self.env.action_spec.space
         self.action_space = gymnasium.spaces.Box(spec.low[0].numpy(), spec.high[0].numpy())

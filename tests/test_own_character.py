@@ -1,5 +1,6 @@
 """The tutorial on a character from a file, command by command, with the smallest budgets."""
 
+import contextlib
 import re
 import shlex
 import sys
@@ -65,6 +66,28 @@ def test_the_folder_holds_what_the_tutorial_names(called):
     for name in ("gymnast.xml", "gymnast.py", "own/character/gymnast.yaml", "runs/gymnast/metrics.csv"):
         assert (folder / name).is_file()
     assert CHARACTERS["gymnast"].feet == ("right_foot", "left_foot")
+
+
+def test_adapting_again_overwrites_nothing_and_says_what_to_do(called, monkeypatch):
+    folder, _ = called
+    before = {path: path.read_bytes() for path in folder.glob("*.*")}
+    for source, name in (("humanoid.xml", "gymnast"), ("humanoid.xml", "humanoid")):
+        arguments = ["torchrl-mcp-character", "adapt", str(folder / source), "--name", name, "--output", str(folder)]
+        monkeypatch.setattr(sys, "argv", arguments)
+        with pytest.raises(SystemExit, match=f"{name}.xml is there already: pass another --name or --output"):
+            character.main()
+    assert before == {path: path.read_bytes() for path in folder.glob("*.*")}
+
+
+def test_the_next_commands_begin_in_the_folder_of_the_files(called, tmp_path, monkeypatch, capsys):
+    folder, _ = called
+    monkeypatch.chdir(tmp_path)
+    arguments = ["adapt", str(folder / "humanoid.xml"), "--name", "athlete", "--output", "bodies"]
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-character", *arguments])
+    with contextlib.suppress(SystemExit):
+        character.main()
+    assert "Next:\n  cd bodies\n  torchrl-mcp-play" in capsys.readouterr().out
+    assert (tmp_path / "bodies" / "own" / "character" / "athlete.yaml").is_file()
 
 
 @pytest.mark.skipif(opengl._platform() is None, reason="no OpenGL to draw with")

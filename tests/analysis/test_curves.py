@@ -75,10 +75,11 @@ def test_a_bin_of_which_a_run_covers_less_than_half_is_left_out(tmp_path, extra,
     assert curve.frames[-1] == ends
 
 
-def test_a_row_half_written_is_left_out(tmp_path):
-    run = constant_run(tmp_path / "run", 1.0, num_rows=2)
-    with (run / "metrics.csv").open("a") as file:
-        file.write("3,30")
+@pytest.mark.parametrize("cut", [1, 2, 4, 12])
+def test_a_row_half_written_is_left_out(tmp_path, cut):
+    run = constant_run(tmp_path / "run", 1.0, num_rows=3)
+    whole = (run / "metrics.csv").read_bytes().rstrip()
+    (run / "metrics.csv").write_bytes(whole[: len(whole) - cut + 1])
     assert [row["frames"] for row in read_metrics(run)] == [100, 200]
 
 

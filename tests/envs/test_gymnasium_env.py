@@ -25,6 +25,13 @@ def test_gymnasium_finds_nothing_wrong(name):
         check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
 
 
+@pytest.mark.parametrize(("name", "rate"), [("Holdout-Ant", 20), ("Heading-Biped", 30)])
+def test_films_play_at_the_rate_of_control(name, rate):
+    env = gymnasium.make(f"torchrl_mcp/{name}-v0")
+    assert env.metadata["render_fps"] == rate
+    assert env.unwrapped.env.control_timestep == pytest.approx(1 / rate)
+
+
 def test_the_info_tells_success():
     env = gymnasium.make("torchrl_mcp/Dribble-Biped-v0")
     _, info = env.reset(seed=0)

@@ -75,7 +75,7 @@ def test_full_reward_for_ever_needs_a_discount():
 
 
 def test_emphasis_and_shaping_exclude_each_other():
-    with pytest.raises(ValueError, match="emphasis with shaping: .* pass one of them"):
+    with pytest.raises(ValueError, match=r"emphasis with shaping: .* pass one of them"):
         make(Dribble, emphasis=EMPHASIS, shaping={"object": {"slope": 1.0, "reach": 5.0}})
 
 

@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint, collectors
-from torchrl_mcp.training.collectors import RemoteSource
+from torchrl_mcp.training.collectors import LocalSource, RemoteSource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Stopwatch
 
@@ -104,6 +104,13 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
     assert numbers(resumed[0]) == numbers(whole[0])
     assert [row["frames"] for row in resumed] == ["128", "256", "384"]
     assert resumed[1]["reward"] != whole[1]["reward"]
+
+
+@pytest.mark.parametrize(("source", "written"), [(LocalSource, "processes or ray"), (RemoteSource, "local")])
+def test_a_source_refuses_the_state_of_another_kind(source, written):
+    state = {"starts": 1} if source is LocalSource else {"env": {}}
+    with pytest.raises(ValueError, match=f"written with collector={written}: resume with the same collector"):
+        source.load_state_dict(object.__new__(source), state)
 
 
 def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):

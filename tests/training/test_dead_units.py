@@ -52,6 +52,11 @@ def test_the_warning_names_the_step_size_of_its_network(network, setting):
         watch(lambda: layers(torch.zeros(64, 3)))
 
 
+def test_networks_without_rectifiers_have_no_dead_units():
+    network = nn.ModuleDict({"critic": nn.Sequential(nn.Linear(2, 2), nn.Tanh())})
+    assert DeadUnits(network)(lambda: network["critic"](torch.zeros(4, 2))) == {}
+
+
 def test_units_that_one_sample_activates_are_alive_and_few_samples_judge_none(networks):
     watch, samples = DeadUnits(networks), torch.zeros(64, 3)
     with torch.no_grad():

@@ -44,7 +44,11 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def adapt(arguments: argparse.Namespace) -> int:
-    """Convert a file into a character, and write it with its module and its configuration."""
+    """Convert a file into a character, and write it with its module and its configuration.
+
+    Raises:
+        ValueError: If MuJoCo cannot read the file, or one to write is there already.
+    """
     name, folder = arguments.name, arguments.output
     spec = adapted(_read(arguments.file))
     spec.modelname = name
@@ -57,6 +61,9 @@ def adapt(arguments: argparse.Namespace) -> int:
         ),
         folder / "own" / "character" / f"{name}.yaml": CONFIG.format(name=name),
     }
+    for path in written:
+        if path.exists():
+            raise ValueError(f"{path} is there already: pass another --name or --output, or remove it")
     for path, text in written.items():
         with replacing(path) as partial:
             partial.write_text(text)
@@ -64,6 +71,8 @@ def adapt(arguments: argparse.Namespace) -> int:
     found = violations(model, feet=feet, key_bodies=key_bodies(model))
     print(*(f"- {violation}" for violation in found), sep="\n", end="\n" if found else "")
     print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.1f} kg. Next:")
+    if folder != Path():
+        print(f"  cd {folder}")
     print(f"  torchrl-mcp-play --agent zero --config-dir own task=heading character={name}")
     print(f"  torchrl-mcp-train --config-dir own task=heading character={name} method=scratch")
     return bool(found)

@@ -24,7 +24,7 @@ class MirroredSamples:
         advantages: Estimates advantages of trajectories ``(N, T)``.
         actor: The actor.
         mirrors: Reflections of ``observation``, ``goal`` and ``action``.
-        tolerance: Largest difference between the log-probabilities of a sample and of its image, in nats.
+        tolerance: How much less likely than the sample its image may be, as a difference of log-probabilities in nats.
 
     Raises:
         ValueError: If the actor explores over something that has no mirror image.

@@ -303,7 +303,7 @@ def _seeds(seeds: Iterable[int]) -> str:
 
 
 def _protocols(runs: Sequence[Run]) -> list[str]:
-    """How each run was evaluated: its episodes, and settings of the environment that differ from those of other runs."""
+    """How each run was evaluated: its episodes, and settings of the environment that other runs have otherwise."""
     environments = [run.evaluation.get("environment", {}) for run in runs]
     telling = _varying(environments)
     return [

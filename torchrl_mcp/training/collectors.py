@@ -139,7 +139,13 @@ class LocalSource:
         return self.env.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state of the environments."""
+        """Restore the state of the environments.
+
+        Raises:
+            ValueError: If the state is of workers.
+        """
+        if "starts" in state:
+            raise ValueError("it was written with collector=processes or ray: resume with the same collector")
         self.env.load_state_dict(state)
 
 
@@ -249,7 +255,13 @@ class RemoteSource:
         return {"starts": self._starts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the number of starts, so that the workers begin with new seeds."""
+        """Restore the number of starts, so that the workers begin with new seeds.
+
+        Raises:
+            ValueError: If the state is of environments in this process.
+        """
+        if "starts" not in state:
+            raise ValueError("it was written with collector=local: resume with the same collector")
         self._starts = state["starts"]
 
     def _next(self) -> TensorDictBase:

@@ -45,6 +45,8 @@ class DeadUnits:
                 handle = layer.register_forward_hook(partial(_record, shares, name))
                 hooks.callback(handle.remove)
             evaluate()
+        if not shares:
+            return {}
         worst: dict[str, float] = {}
         for name, share in zip(shares, torch.stack([*shares.values()]).tolist(), strict=True):
             key = f"dead_units/{name.partition('.')[0]}"

@@ -91,16 +91,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete row is left out."""
+    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete last row is left out."""
     path = run / METRICS
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return [
-            {name: float(value or "nan") for name, value in row.items()}
-            for row in csv.DictReader(file)
-            if None not in row.values()
-        ]
+        whole = (line for line in file if line.endswith("\n"))
+        return [{name: float(value or "nan") for name, value in row.items()} for row in csv.DictReader(whole)]
 
 
 def find_all(run: Path) -> list[Path]:
