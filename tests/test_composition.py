@@ -84,3 +84,47 @@ def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
     imitation = composed("task=imitation")
     assert (imitation.training.total_frames, imitation.optimizer.schedule.target_kl) == (10_000_000, 0.05)
     assert (composed().training.num_envs, composed().training.minibatch_size) == (64, 512)
+
+
+SHARED = ["observation_normaliser"]
+TRANSFER = {  # what a method keeps of its pre-training, and what of that does not learn any more (appendix E)
+    "scratch": ([], []),
+    "finetune": (["policy", *SHARED], []),
+    "hierarchical": (["primitives", *SHARED],) * 2,
+    "option_critic": (["options", "terminations", *SHARED],) * 2,
+    "moe": (["primitives", *SHARED],) * 2,
+    "latent_space": (["decoder", *SHARED],) * 2,
+    "mcp": (["primitives", *SHARED],) * 2,
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_transfer_keeps_and_freezes_what_the_paper_says(method):
+    cfg = composed(f"method={method}", "task=heading", "stage=transfer")
+    assert (list(cfg.transfer.keep), list(cfg.transfer.freeze)) == TRANSFER[method]
+
+
+ANYWHERE = [-3.141592653589793, 3.141592653589793]
+PLAIN = {"initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "shaping": {}, "staggered": False}
+PLAIN |= {"terminate_on_fall": True, "self_collision": False, "friction_cone": "pyramidal", "physics_timestep": None}
+OBJECT = PLAIN | {"target_distances": [0.0, 10.0], "object_directions": ANYWHERE, "target_directions": ANYWHERE}
+OBJECT |= {
+    "emphasis": None,
+    "success_reward": False,
+    "target_distance_power": 2,
+    "speed": 1.0,
+    "max_episode_steps": 900,
+}
+EVALUATED = {  # appendix D, and what docs/decisions.md adds
+    "heading": PLAIN | {"initial_directions": [0.0, 0.0], "max_turn": 0.15, "speed": 1.0, "max_episode_steps": 600},
+    "carry": OBJECT | {"object_distances": [0.0, 10.0]},
+    "dribble": OBJECT | {"object_distances": [0.5, 10.0]},
+}
+
+
+@pytest.mark.parametrize("task", EVALUATED)
+def test_policies_are_evaluated_in_the_task_of_the_paper(task):
+    cfg = composed(f"task={task}", "stage=transfer")
+    found = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
+    assert {name: found[name] for name in EVALUATED[task]} == EVALUATED[task]
+    assert found.keys() - EVALUATED[task].keys() <= {"discount", "goal_positions"}  # of training alone, or its own

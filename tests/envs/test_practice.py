@@ -148,3 +148,15 @@ def test_a_staggered_training_goes_on_at_the_same_moments_after_it_was_interrupt
     other.set_extra_state(saved)
     other.reset()
     assert torch.equal(other.episode["elapsed_steps"], elapsed)
+
+
+@every_task
+def test_a_diverging_simulation_earns_neither(task):
+    env = make(task, emphasis=EMPHASIS)
+    env.reset()
+    state = env.get_state()
+    state["qvel"][2] = 1e8
+    outcome = env.step(env.reset(state, set_state=True).set("action", torch.zeros(env.action_spec.shape)))["next"]
+    assert outcome["terminated"][2]
+    assert outcome["reward"][2] == outcome["task_reward"][2] == 0
+    assert (outcome["task_reward"][:2] > 0).all()

@@ -254,3 +254,26 @@ def test_a_single_episode_has_no_spread():
     numbers = episode_statistics(episodes([3.0]), lambda x: x)
     assert (numbers["normalised_return"], numbers["normalised_return_std"]) == (3.0, 0.0)
     assert numbers["interval"] == [3.0, 3.0]
+
+
+class Lucky(Countdown):
+    """Raises a flag in every step of every episode but the first."""
+
+    metric_names: ClassVar = {"success": ["success"]}
+
+    def __init__(self, lengths):
+        super().__init__(lengths)
+        self.begun = torch.zeros(len(lengths), 1, dtype=torch.int64)
+        self.observation_spec["success"] = Binary(1, shape=(*self.batch_size, 1), dtype=torch.bool)
+
+    def _emit(self, done, **kwargs):
+        return super()._emit(done, success=self.begun > 1, **kwargs)
+
+    def _reset(self, tensordict=None, **kwargs):
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        self.begun += 1 if mask is None else mask
+        return super()._reset(tensordict, **kwargs)
+
+
+def test_flags_of_later_episodes_do_not_count():
+    assert not evaluate(IDLE, Lucky([1, 2, 5])).metrics["success"].any()

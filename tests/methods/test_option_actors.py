@@ -176,3 +176,12 @@ def test_every_actor_that_chooses_options_has_its_diagnostics():
         assert {f"options/usage_{k}" for k in range(K)} | {"options/duration"} <= found.keys()
     _, actor = pretraining()
     assert diagnostics(actor, situations()) == {}
+
+
+def test_terminations_stay_random_in_deterministic_play():
+    torch.manual_seed(0)
+    _, actor = option_critic(initial=0.3)
+    many = situations(held_steps=1).expand(400, N).reshape(-1)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        rate = actor.policy(many)["begins"].float().mean().item()
+    assert rate == pytest.approx(0.3, abs=0.04)  # 4,800 draws: six standard errors

@@ -156,3 +156,15 @@ def test_environments_with_a_memory_are_put_into_a_state_and_saved_as_a_whole():
 def counting_ants(tensordict):
     """As :func:`counting`, for ants."""
     return counting(tensordict).set("action", torch.full((*tensordict.batch_size, 8), 0.1))
+
+
+@pytest.mark.parametrize("transform", [OptionMemory, lambda: CorrelatedNoise(2, 0.9)], ids=["options", "noise"])
+def test_what_is_saved_when_some_episodes_have_just_begun_is_what_all_are_shown(transform):
+    env = TransformedEnv(Lengths(), transform())
+    state = env.reset()
+    for _ in range(3):  # the first of three episodes ends
+        step, state = env.step_and_maybe_reset(state.set("action", torch.zeros(3, 1)))
+    assert step["next", "done"].flatten().tolist() == [True, False, False]
+    for key, saved in env.transform.get_extra_state().items():
+        assert torch.equal(saved, state[key]), key
+        assert torch.equal(saved[1:], step["next", key][1:]), key

@@ -308,3 +308,19 @@ def test_the_place_between_standing_still_and_the_ideal_is_averaged_over_seeds(w
     (cell,) = grouped(*folders)
     assert len(cell.complete) == 2
     assert cell.reach == pytest.approx({"place": 0.6, "standing": 0.2, "ideal": 0.6})
+
+
+def test_metrics_are_means_over_seeds_of_deterministic_episodes_without_terms_of_the_reward(write_run):
+    folders = [write_run(str(seed), seed=seed, task="carry", score=0.5) for seed in range(2)]
+    for folder, share in zip(folders, (0.25, 0.75), strict=True):
+        found = json.loads((folder / "evaluation.json").read_text())
+        found["deterministic"]["metrics"] = {"success": share, "reward_pose": 0.3}
+        found["stochastic"]["metrics"] = {"success": 0.0, "reward_pose": 0.3}
+        (folder / "evaluation.json").write_text(json.dumps(found))
+    (cell,) = grouped(*folders)
+    assert cell.metrics == {"success": 0.5}
+
+
+def test_the_speed_is_of_the_steps_that_were_taken(write_run):
+    (cell,) = grouped(write_run("a", score=0.5), write_run("b", seed=1, progress=0.5))
+    assert cell.speed == pytest.approx((1000 + 500) / (10 + 5))  # the runs of the fixture take 10 ms per step

@@ -43,18 +43,9 @@ def pretrained(tmp_path_factory):
     return experiment.train(configure(tmp_path_factory.mktemp("runs") / "mcp"))
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["autocast=true"],
-        ["method=scratch"],
-        ["mixer=additive", "gating=softmax", "num_primitives=3", "autocast=false"],
-    ],
-    ids=" ".join,
-)
-def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path, overrides):
+def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    settings = [*overrides, "checkpoint_interval=1", "training.total_frames=768"]
+    settings = ["autocast=true", "checkpoint_interval=1", "training.total_frames=768"]
     experiment.train(configure(whole, *settings))
 
     arguments = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={killed}", *settings]
@@ -165,18 +156,17 @@ def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, 
     assert not torch.equal(before["primitives.output.weight"], after["primitives.output.weight"])
 
 
-@pytest.mark.parametrize(("autocast", "tolerance"), [("false", 1e-5), ("true", 2e-3)])
 @pytest.mark.parametrize("method", ["method=mcp", "mixer=additive", "method=scratch"])
-def test_collection_and_loss_agree_before_the_first_update(tmp_path, method, autocast, tolerance):
+def test_collection_and_loss_agree_before_the_first_update_in_bfloat16(tmp_path, method):
     # One gradient step per iteration: its report is from before the step. Matrix products of other batch sizes round
-    # differently, in bfloat16 more than in float32.
+    # differently. test_methods has this test in float32.
     folder = tmp_path / "run"
     one_step = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=128"]
-    experiment.train(configure(folder, method, f"autocast={autocast}", *one_step))
+    experiment.train(configure(folder, method, "autocast=true", *one_step))
     (first,) = rows(folder)
     assert float(first["loss/clip_fraction"]) == 0.0
-    assert abs(float(first["loss/max_ratio"]) - 1.0) <= tolerance
-    assert abs(float(first["loss/kl"])) <= tolerance
+    assert abs(float(first["loss/max_ratio"]) - 1.0) <= 2e-3
+    assert abs(float(first["loss/kl"])) <= 2e-3
 
 
 def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_good_checkpoint(tmp_path):
@@ -277,3 +267,29 @@ def test_in_the_warm_up_normalisers_and_critic_learn_and_the_policy_waits(tmp_pa
     assert float(waiting["loss/kl"]) == pytest.approx(0.0, abs=1e-6)
     assert float(waiting["loss/actor_grad_norm"]) == 0.0
     assert all(float(row["loss/actor_grad_norm"]) > 0 for row in learning)
+
+
+def test_finetuning_begins_with_the_noise_of_the_task_and_not_with_that_of_imitation(tmp_path):
+    imitation = ["method=finetune", "task=imitation", "character=biped", "learned_std=true", "action_std=0.02"]
+    pretrained = experiment.train(configure(tmp_path / "run", *imitation, "training.total_frames=128"))
+    task = ["method=finetune", "task=heading", "stage=transfer", "learned_std=true", "action_std=0.1"]
+    cfg = configure(tmp_path / "task", *task, f"pretrained={pretrained}")
+    agent = build.make_agent(cfg, build.make_env(cfg, num_envs=1, seed=0), checkpoint.find(pretrained))
+    scale = agent.parts["policy"].scale.state_independent_scale.exp()
+    torch.testing.assert_close(scale, torch.full_like(scale, 0.1))
+
+
+def test_metrics_are_means_over_the_episodes_that_ended_and_over_all_steps(tmp_path):
+    settings = ["method=scratch", "task=dribble", "character=biped", "practice=printed"]
+    cfg = configure(tmp_path, *settings, "task.transfer.max_episode_steps=5", "++task.transfer.terminate_on_fall=false")
+    source = build.make_source(cfg)
+    trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, tmp_path)
+    batch = source.env.rollout(12, break_when_any_done=False)
+    batch["next", "success"] = torch.arange(48).view(4, 12, 1) < 12
+    rewards = batch["next", "reward"].squeeze(-1)
+    returns = torch.cat([rewards[:, :5].sum(1), rewards[:, 5:10].sum(1)])
+    metrics = trainer._episode_metrics(batch)
+    assert (metrics["episode/count"], metrics["episode/length"], metrics["task/success"]) == (8, 5.0, 0.25)
+    assert metrics["episode/return"] == pytest.approx(returns.mean().item(), rel=1e-5)
+    assert metrics["episode/normalised_return"] == pytest.approx(returns.mean().item() / 5, rel=1e-5)
+    assert metrics["reward"] == pytest.approx(rewards.mean().item(), rel=1e-5)
