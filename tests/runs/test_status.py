@@ -80,10 +80,12 @@ def test_the_table_shows_what_runs_first_and_counts_what_it_leaves_out(runs):
     assert "1 running, 1 stopped, 1 done, 1 waiting; 2 not shown" in lines[3]
 
 
-def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkeypatch):
+def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkeypatch, tmp_path_factory):
     monkeypatch.setattr("torchrl_mcp.runs.status.INTERVAL", 0.01)
+    whole = tmp_path_factory.mktemp("made") / "later"
+    make_run(whole, frames=1000, evaluation=0.5)
     with overview(runs, {runs / name: 1000 for name in ("alive", "later")}):
-        make_run(runs / "later", frames=1000, evaluation=0.5)
+        whole.rename(runs / "later")  # in one step: a run that is half made is damaged
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1:3] for line in lines] in (
         [["running", "alive"], ["done", "later"]],
