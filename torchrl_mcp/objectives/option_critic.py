@@ -105,7 +105,7 @@ class OptionValueLoss(ValueLoss):
     Of the critic it evaluates what the values need: terminations are the actor's, which may learn at the same time.
 
     Args:
-        critic_network: From ``observation`` and ``goal`` to ``option_values``.
+        critic_network: Sequence from ``observation`` and ``goal`` to ``option_values``, ``(B, K)``, and other keys.
         coeff: Weight of the error, :math:`c`.
     """
 
