@@ -75,9 +75,7 @@ def test_the_option_critic_learns_options_that_beat_chance():
         num_options=4,
     )
     actor, critic = option_critic_actor(parts, num_options=4, epsilon=0.1), option_values(parts, 2, 4)
-    advantages = OptionAdvantages(
-        critic, gamma=0.95, lmbda=0.95, clip=4.0, epsilon=0.1, termination_cost=0.01, regret_per_step=False
-    )
+    advantages = OptionAdvantages(critic, gamma=0.95, lmbda=0.95, clip=4.0, epsilon=0.1, termination_cost=0.01)
     loss = OptionCriticLoss(actor.trained, critic, clip_epsilon=0.2, bound_coeff=0.0)
     optimizer = torch.optim.Adam(
         [{"params": actor.trained.parameters(), "lr": 3e-3}, {"params": parts["critic"].parameters(), "lr": 2e-2}]

@@ -203,8 +203,7 @@ def tabular_critic():
 
 @pytest.mark.parametrize("lmbda", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("epsilon", [0.0, 0.2])
-@pytest.mark.parametrize("regret_per_step", [False, True])
-def test_estimates_follow_the_definition(epsilon, lmbda, regret_per_step):
+def test_estimates_follow_the_definition(epsilon, lmbda):
     gamma, cost, clip = 0.9, 0.01, 1.5
     batch = random_batch(
         [[GOES_ON] * 6, [GOES_ON, TERMINATED, GOES_ON, TRUNCATED, GOES_ON, GOES_ON], [GOES_ON] * 5 + [TERMINATED]]
@@ -221,7 +220,7 @@ def test_estimates_follow_the_definition(epsilon, lmbda, regret_per_step):
             arrival = 0.0 if terminated else values[there][option] - TERMINATIONS[there][option].item() * gain
             delta = (1 - gamma) * step["next", "reward"].item() + gamma * arrival - values[here][option]
             later = delta + (0.0 if ended else gamma * lmbda * later)
-            regret = 0.0 if terminated else gain / (1 if regret_per_step else 1 - gamma) + cost
+            regret = 0.0 if terminated else gain / (1 - gamma) + cost
             estimated.insert(0, (later, later + values[here][option], regret))
         for numbers, list_ in zip(zip(*estimated, strict=True), (advantages, targets, regrets), strict=True):
             list_ += numbers
@@ -232,7 +231,7 @@ def test_estimates_follow_the_definition(epsilon, lmbda, regret_per_step):
         "termination_advantage": regrets,
     }
     settings = {"gamma": gamma, "lmbda": lmbda, "clip": clip, "epsilon": epsilon, "termination_cost": cost}
-    samples = OptionAdvantages(tabular_critic(), regret_per_step=regret_per_step, **settings)(batch)
+    samples = OptionAdvantages(tabular_critic(), **settings)(batch)
     for key, numbers in expected.items():
         torch.testing.assert_close(samples[key].flatten(), torch.tensor(numbers), atol=1e-5, rtol=1e-5, msg=key)
 

@@ -30,8 +30,8 @@ class OptionAdvantages:
     time limit or the end of the batch is bootstrapped.
 
     Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`, so that values have the
-    size of a reward. With ``regret_per_step``, the termination advantage has that size as well, and :math:`\xi` is a
-    share of the reward of a step. Otherwise both are in units of returns, :math:`1 / (1 - \gamma)` times as large.
+    size of a reward. The advantage of terminations and :math:`\xi` are in units of returns, :math:`1 / (1 - \gamma)`
+    times as large.
 
     Args:
         critic: From ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
@@ -40,7 +40,6 @@ class OptionAdvantages:
         clip: Largest absolute advantage of an action after normalisation to zero mean and unit variance.
         epsilon: Probability of a random choice in the policy over options, :math:`\pi_\Omega`.
         termination_cost: :math:`\xi`, which keeps options from ending at every step.
-        regret_per_step: Whether the termination advantage is in units of rewards, or of returns.
 
     Reference:
         Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017. https://arxiv.org/abs/1609.05140
@@ -57,12 +56,10 @@ class OptionAdvantages:
         clip: float,
         epsilon: float,
         termination_cost: float,
-        regret_per_step: bool,
     ) -> None:
         self.critic = critic
         self.reward_scale, self.clip = 1 - gamma, clip
         self.epsilon, self.termination_cost = epsilon, termination_cost
-        self.regret_scale = 1.0 if regret_per_step else 1 / self.reward_scale
         self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
     @torch.no_grad()
@@ -87,7 +84,7 @@ class OptionAdvantages:
         advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
         batch["advantage"] = advantage.clamp(-self.clip, self.clip)
         batch["value_target"] = trajectories["value_target"]
-        regret = (kept - chosen) * self.regret_scale + self.termination_cost
+        regret = (kept - chosen) / self.reward_scale + self.termination_cost
         batch["termination_advantage"] = regret * ~batch["next", "terminated"]
         return batch
 

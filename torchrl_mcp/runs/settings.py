@@ -70,8 +70,8 @@ NAMES_BY_RULE: dict[Rule, str] = {
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
     SEED: "seed",
     POSITIVE: """
-        lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale reach
-        max_error width kept_width
+        lr critic_lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale
+        reach max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",
@@ -85,7 +85,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind regret_per_step staggered restart_noise
+        terminate_when_unhealthy success_reward parts.blind staggered restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects object_distances
