@@ -247,8 +247,19 @@ def test_the_paper_preset_holds_table_5(method, stage, step_size):
     assert cfg.objective.loss.clip_epsilon == 0.02
 
 
+@pytest.mark.parametrize(
+    ("method", "decay"),
+    [("mcp", 0.8), ("moe", 0.8), ("latent_space", 0.8), ("finetune", 0.8), ("hierarchical", 0.8), ("option_critic", 0.5)],
+)
+def test_fast_imitation_has_shorter_returns_than_tasks(method, decay):
+    overrides = ("preset=comparison", f"method={method}", "character=biped")
+    assert configure(*overrides, "task=imitation").objective.advantages.lmbda == decay
+    transfer = configure(*overrides, "task=heading", "stage=transfer").objective.advantages.lmbda
+    assert transfer == (0.5 if method == "option_critic" else 0.95)
+
+
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: "/".join(path.parts[-2:]))
 def test_every_configuration_file_is_short_and_says_what_it_is(path):
     lines = path.read_text().splitlines()
     assert any(line.startswith("# ") and not line.startswith("# @package") for line in lines[:2])
-    assert path.name == "train.yaml" or len(lines) <= {"method": 30, "task": 50}.get(path.parent.name, 20)
+    assert path.name == "train.yaml" or len(lines) <= {"method": 30, "preset": 25, "task": 50}.get(path.parent.name, 20)
