@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment
@@ -114,14 +115,17 @@ def test_a_source_refuses_the_state_of_another_kind(source, written):
         source.load_state_dict(object.__new__(source), state)
 
 
-def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options(tmp_path):
+def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options_in_bfloat16(tmp_path):
     cfg = configure(tmp_path, "method=option_critic", "epsilon=1")
     source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2, num_threads=1)
-    policy, watch = build.make_agent(cfg, source.env).actor.policy, Stopwatch()
-    source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=False, stopwatch=watch)
+    product = TensorDictModule(torch.nn.LazyLinear(1), in_keys=["observation"], out_keys=["product"])
+    product(source.env.reset())
+    policy, watch = TensorDictSequential(build.make_agent(cfg, source.env).actor.policy, product), Stopwatch()
+    source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=True, stopwatch=watch)
     batch = source.collect()
     source.stop()
     assert batch.shape == (4, 20)
+    assert batch["product"].dtype is torch.bfloat16
     for key in ("observation", "action"):
         assert len(batch[key][:, 0].unique(dim=0)) == 4
     assert batch["option"].unique().numel() > 4  # of eight, chosen at random
