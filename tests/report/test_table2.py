@@ -133,8 +133,9 @@ def test_the_published_runs_make_the_readmes_table(tmp_path, monkeypatch):
         )
         if stage == "transfer":
             steps = int(re.search(r"total_frames: (\d+)", settings)[1])
+            pretraining = re.search(r"^budget:\n(?:  .*\n)*?  pretrain: (\d+)", settings, re.MULTILINE)[1]
             found = json.loads(path.read_text())["deterministic"]
-            evaluations[task, character, method, steps][exploration].append(found)
+            evaluations[task, character, method, steps][exploration, pretraining].append(found)
     table = (PUBLISHED / "table.md").read_text()
     assert table in (ROOT / "README.md").read_text()
     head, *lines = cells_of(table)
