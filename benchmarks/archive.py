@@ -1,0 +1,164 @@
+"""Archives of runs: run folders without checkpoints, and the tables and learning curves of the runs in them.
+
+An archive has the configuration, the evaluation and the origin of each run, and of its metrics only the columns of
+learning curves. ``torchrl-mcp-report`` reads it unpacked.
+"""
+
+import argparse
+import csv
+import io
+import shlex
+import tarfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from report import write
+
+from torchrl_mcp.analysis.curves import draw_curves, learning_curves
+from torchrl_mcp.analysis.figures import save_figure
+from torchrl_mcp.report.comparison import Cell, cells
+from torchrl_mcp.report.paper import PLACES
+from torchrl_mcp.report.results import MODES, Run, find_runs
+from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, NORMALISED_RETURN, PROVENANCE
+
+ARCHIVE = "runs.tar.xz"
+CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
+"""Columns of metrics in an archive: those of learning curves and wall times."""
+
+EMPTY = ""
+"""A cell of a table without runs, or without a number in the paper."""
+
+
+@contextmanager
+def archived(description: str, results: Path) -> Iterator[tuple[list[Cell], Path]]:
+    """Archive runs if the command line gives a folder of them, and unpack the archive.
+
+    Args:
+        description: Of the script.
+        results: Folder of the archive, unless the command line gives another.
+
+    Yields:
+        The archived runs as cells, and the folder of the archive.
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="?", help="the run_root of the runs; default: the archive")
+    parser.add_argument("--output", type=Path, default=results, help="folder to write to, with the archive")
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    archive = arguments.output / ARCHIVE
+    if arguments.runs:
+        pack(arguments.runs, archive)
+    elif not archive.exists():
+        parser.error(f"there is no {archive}: give the folder of the runs")
+    with TemporaryDirectory() as folder:
+        with tarfile.open(archive) as packed:
+            packed.extractall(folder, filter="data")
+        yield cells(find_runs([Path(folder)])[0]), arguments.output
+
+
+def pack(root: Path, archive: Path) -> None:
+    """Write the complete runs of a folder, without checkpoints and without names of folders of this machine."""
+    runs = [run for run in find_runs([root])[0] if run.state == "complete"]
+    with tarfile.open(archive, "w:xz", preset=9) as packed:
+        for run in runs:
+            contents = {name: (run.path / name).read_text() for name in (CONFIG, EVALUATION, PROVENANCE)}
+            contents[METRICS] = curve(run.path / METRICS)
+            for name, content in contents.items():
+                data = content.replace(str(root.resolve()), "runs").replace(str(root), "runs").encode()
+                entry = tarfile.TarInfo(f"{run.path.resolve().relative_to(root.resolve())}/{name}")
+                entry.size = len(data)
+                packed.addfile(entry, io.BytesIO(data))
+
+
+def curve(metrics: Path) -> str:
+    """Return the metrics of a run with the columns of ``CURVE`` alone."""
+    kept = io.StringIO()
+    with metrics.open(newline="") as file:
+        writer = csv.DictWriter(kept, CURVE, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(csv.DictReader(file))
+    return kept.getvalue()
+
+
+def write_tables(found: Sequence[Cell], output: Path) -> None:
+    """Write the table and the learning curves of each task, and the list of all runs."""
+    for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
+        here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
+        twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
+        stem = output / "_".join([*place, stage] if twice else place)
+        stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
+        curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in here})
+        save_figure(draw_curves(curves), stem)
+    write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
+
+
+def label(cell: Cell) -> str:
+    """Return the name of a cell in the table of its task: the method, and how it differs from others of the method."""
+    others = [f"{name}={value}" for name, value in cell.settings.items() if name not in ("preset", "total_frames")]
+    steps = [f"{cell.complete[0].frames / 1e6:.1f} M steps"] if "total_frames" in cell.settings else []
+    return ", ".join([cell.title, *steps, *others])
+
+
+def line(cell: Cell) -> dict[str, Any]:
+    """Return a row of the table of a task."""
+    chosen = [run.evaluation["deterministic"] for run in cell.complete]
+    deviation = f" ± {cell.deviation():.3f}" if len(chosen) > 1 else ""
+    facts: dict[str, Any] = {
+        "": label(cell),
+        "seeds": len(chosen),
+        "steps": f"{cell.complete[0].frames:,}",
+        "deterministic": f"{average(cell.returns()):.3f}{deviation}",
+        "stochastic": f"{average(cell.returns('stochastic')):.3f}",
+        "fallen": f"{average([numbers['terminated'] for numbers in chosen]):.0%}",
+    }
+    if "success" in cell.metrics:
+        facts["success"] = f"{cell.metrics['success']:.0%}"
+    if cell.place[0] == "imitation":
+        facts["completed"] = f"{1 - average([numbers['terminated'] for numbers in chosen]):.0%}"
+        facts["tracking error"] = f"{cell.metrics['tracking_error']:.3f} m"
+        del facts["fallen"]
+    else:
+        facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
+        facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
+    return facts | {"minutes": round(cell.seconds / 60), "commit": ", ".join(cell.commits)}
+
+
+def score(cell: Cell | None) -> str:
+    """Return a cell in a table: the mean deterministic return, the share of successes, and the number of seeds."""
+    if cell is None:
+        return EMPTY
+    success = f", {cell.metrics['success']:.0%}" if "success" in cell.metrics else ""
+    return f"{average(cell.returns()):.3f}{success} ({len(cell.complete)})"
+
+
+def average(values: Sequence[float]) -> float:
+    """Return the mean."""
+    return sum(values) / len(values)
+
+
+def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
+    """Yield the facts about a run with its results, for each mode."""
+    machine, command = run.provenance.get("machine", {}), run.provenance.get("command", [])
+    for mode in MODES:
+        numbers = run.evaluation[mode]
+        yield {
+            **dict(zip(("task", "character"), cell.place, strict=True)),
+            "method": label(cell),
+            "stage": cell.stage,
+            "seed": run.seed,
+            "steps": run.frames,
+            "mode": mode,
+            **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
+            "success": numbers["metrics"].get("success", EMPTY),
+            "place": numbers.get("reach", {}).get("place", EMPTY),
+            "episodes": numbers["episodes"],
+            "seconds": round(run.seconds),
+            "preset": run.preset,
+            "commit": run.commit,
+            **{key: machine.get(key, "") for key in ("processor", "cores", "torch", "mujoco")},
+            "command": shlex.join(command),
+        }
