@@ -40,7 +40,7 @@ class Imitation(PDCharacterEnv):
 
     An episode begins at a random moment of a random clip, in the state of the reference. With probability
     :math:`\Delta t /` ``switch_interval`` per step the reference jumps to another random moment, moved to the
-    character's position and heading: the moment of ``switch_candidates`` with the bodies closest to the
+    character's position and heading: of ``switch_candidates`` moments, the one with the bodies closest to the
     character's, by :func:`~torchrl_mcp.envs.imitation_reward.mismatch`. ``goal`` (2 x 13 L) holds, for the next two
     steps, the positions of the reference's L bodies relative to the ground below the character, their orientations and
     velocities, in the character's heading frame. ``tracking_error`` (1) is the mean distance of the bodies from the
@@ -68,8 +68,9 @@ class Imitation(PDCharacterEnv):
         max_error: Largest mean distance of bodies from the reference, in metres; 0.5 is clearly worse than 0.3.
         switch_interval: Mean time between changes of the reference, in seconds; infinite for none. Not stated in
             the paper.
-        switch_candidates: Number of random moments of which the most similar becomes the reference. With 1, some
-            changes are impossible for a body, as from a fast walk to standing; more candidates make them easier.
+        switch_candidates: Number of random moments of which the most similar becomes the reference. With 1,
+            "switched randomly" as in section 5.1, some changes are impossible for a body, as from a fast walk to
+            standing; more candidates make them easier.
         switch_to: ``"any"`` clip, or the ``"same"``, which moves the reference back to a character that has drifted
             away and does not observe it.
         clip_end: Action at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
@@ -97,7 +98,7 @@ class Imitation(PDCharacterEnv):
         terms: Mapping[str, Mapping[str, float]],
         max_error: float = 0.3,
         switch_interval: float = 5.0,
-        switch_candidates: int = 16,
+        switch_candidates: int = 1,
         switch_to: str = "any",
         clip_end: str = "truncate",
         failure_weighting: float = 0.0,

@@ -14,7 +14,7 @@ from torch import nn
 
 from torchrl_mcp import conf
 from torchrl_mcp.cli import evaluate, train
-from torchrl_mcp.runs import benchmark, experiment, policies
+from torchrl_mcp.runs import benchmark, build, experiment, policies
 from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -253,6 +253,14 @@ def test_fast_imitation_has_shorter_returns_than_tasks(method):
     imitation = configure(*overrides, "task=imitation").objective.advantages.lmbda
     transfer = configure(*overrides, "task=heading", "stage=transfer").objective.advantages.lmbda
     assert (imitation, transfer) == ((0.5, 0.5) if method == "option_critic" else (0.8, 0.95))
+
+
+@pytest.mark.parametrize(
+    ("method", "candidates"), [("mcp", 1), ("moe", 1), ("option_critic", 1), ("finetune", 16), ("hierarchical", 16)]
+)
+def test_only_methods_that_see_their_reference_imitate_changes_to_any_moment(method, candidates):
+    cfg = configure("task=imitation", f"method={method}", "num_threads=1")
+    assert build.make_env(cfg, num_envs=1, seed=0).switch_candidates == candidates
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: "/".join(path.parts[-2:]))
