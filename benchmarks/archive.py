@@ -19,7 +19,7 @@ from report import write
 
 from torchrl_mcp.analysis.curves import draw_curves, learning_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.report.comparison import Cell, cells
+from torchrl_mcp.report.comparison import DEFAULT, Cell, cells
 from torchrl_mcp.report.paper import PLACES
 from torchrl_mcp.report.results import MODES, Run, find_runs
 from torchrl_mcp.runs.tables import text_table
@@ -92,13 +92,17 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
         stem = output / "_".join([*place, stage] if twice else place)
         stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
         curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in here})
-        save_figure(draw_curves(curves), stem)
+        save_figure(draw_curves(curves, ylabel="normalised return in training"), stem)
     write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
 
 
 def label(cell: Cell) -> str:
     """Return the name of a cell in the table of its task: the method, and how it differs from others of the method."""
-    others = [f"{name}={value}" for name, value in cell.settings.items() if name not in ("preset", "total_frames")]
+    others = [
+        f"pre-trained for {value / 1e6:g} M" if name == "budget.pretrain" and value != DEFAULT else f"{name}={value}"
+        for name, value in cell.settings.items()
+        if name not in ("preset", "total_frames")
+    ]
     steps = [f"{cell.complete[0].frames / 1e6:.1f} M steps"] if "total_frames" in cell.settings else []
     return ", ".join([cell.title, *steps, *others])
 

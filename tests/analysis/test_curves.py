@@ -127,6 +127,17 @@ def test_each_curve_is_one_line_of_its_own_colour_that_the_legend_names(tmp_path
         np.testing.assert_allclose(line.get_ydata(), 0.5)
 
 
+@pytest.mark.parametrize("length", [1, 30, 60])
+def test_the_legend_lies_within_the_figure_and_leaves_the_axes_their_height(tmp_path, length):
+    run = constant_run(tmp_path / "run", 0.5)
+    figure = draw_curves(learning_curves({letter * length: [run] * 2 for letter in "abcdefghijk"}, num_bins=4))
+    figure.draw_without_rendering()
+    legend, axes = figure.legends[0].get_window_extent(), figure.axes[0].get_window_extent()
+    assert 0 <= legend.x0 < legend.x1 <= figure.bbox.width
+    assert axes.y1 <= legend.y0 < legend.y1 <= figure.bbox.height
+    assert axes.height > 1.8 * figure.dpi
+
+
 def test_lines_can_have_styles_of_their_own_and_need_no_legend(tmp_path):
     curves = learning_curves({name: [constant_run(tmp_path / name, 0.5)] for name in "ab"})
     axes = Figure().add_subplot()

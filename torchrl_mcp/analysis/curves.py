@@ -19,6 +19,9 @@ from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
 
 Array = NDArray[np.float64]
 
+LEGEND_WIDTH = 38
+"""Letters of a legend's longest line that leave room for a second column."""
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -81,9 +84,10 @@ def draw_curves(
     curves: Sequence[Curve], *, xlabel: str = "environment steps", ylabel: str = "normalised return"
 ) -> Figure:
     """Draw curves as lines, each with the range of its seeds as a band around it, and a legend above."""
-    figure = new_figure(6.4, 3.6)
+    columns = 1 if any(len(_legend(curve)) > LEGEND_WIDTH for curve in curves) else 2
+    figure = new_figure(6.4, 2.8 + 0.2 * math.ceil(len(curves) / columns))
     plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
+    figure.legend(loc="outside upper center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 
@@ -121,7 +125,7 @@ def plot_curves(
 
 
 def _legend(curve: Curve) -> str:
-    return f"{curve.label} ({curve.seeds} seeds: mean, range)" if curve.seeds > 1 else curve.label
+    return f"{curve.label} ({curve.seeds} seeds)" if curve.seeds > 1 else curve.label
 
 
 def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
