@@ -97,11 +97,15 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
 
 
 def label(cell: Cell) -> str:
-    """Return the name of a cell in the table of its task: the method, and how it differs from others of the method."""
+    """Return the name of a cell in the table of its task: the method, and how it differs from others of the method.
+
+    Settings that are the method's standard, or that a run leaves to a default, are left out.
+    """
+    standard = cell.runs[0].standard
     others = [
-        f"pre-trained for {value / 1e6:g} M" if name == "budget.pretrain" and value != DEFAULT else f"{name}={value}"
+        f"pre-trained for {value / 1e6:g} M" if name == "budget.pretrain" else f"{name}={value}"
         for name, value in cell.settings.items()
-        if name not in ("preset", "total_frames")
+        if name not in ("preset", "total_frames") and value != standard.get(name, DEFAULT)
     ]
     steps = [f"{cell.complete[0].frames / 1e6:.1f} M steps"] if "total_frames" in cell.settings else []
     return ", ".join([cell.title, *steps, *others])

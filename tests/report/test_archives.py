@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import mean
 
 import pytest
+from omegaconf import OmegaConf
 
 from torchrl_mcp.cli import report
 
@@ -188,3 +189,20 @@ def test_the_published_runs_make_the_readmes_table(tmp_path, monkeypatch):
     report.main()
     page = (tmp_path / "report/report.md").read_text()
     assert all(re.match(r"[\d.]+", cell)[0] in page for cell in shown.values())
+
+
+def test_the_published_ablations_make_their_table(tmp_path):
+    """Each cell has the mean of the evaluations in the archive whose configurations have the row's choices."""
+    runs, found = unpack(PUBLISHED / "ablations/runs.tar.xz", tmp_path), defaultdict(list)
+    for path in runs.rglob("evaluation.json"):
+        settings = OmegaConf.load(path.with_name("config.yaml"))
+        if settings.stage.name == "transfer":
+            trained = "gate" if "primitives" in settings.transfer.freeze else "gate and primitives"
+            chosen = (str(settings.num_primitives), settings.mixer.name, settings.exploration.name, trained)
+            found[*chosen, settings.task.name].append(json.loads(path.read_text())["deterministic"])
+    head, *rows = cells_of((PUBLISHED / "ablations/table.md").read_text())
+    shown = {(*row[:4], task): cell for row in rows for task, cell in zip(head[5:], row[5:], strict=True) if cell}
+    assert shown.keys() == found.keys()
+    for key, cell in shown.items():
+        share = f", {mean(each['metrics']['success'] for each in found[key]):.0%}" if key[-1] == "dribble" else ""
+        assert cell == f"{normalised_return(found[key]):.3f}{share} ({len(found[key])})"
