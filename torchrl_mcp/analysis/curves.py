@@ -85,7 +85,7 @@ def draw_curves(
 ) -> Figure:
     """Draw curves as lines, each with the range of its seeds as a band around it, and a legend above."""
     columns = 1 if any(len(_legend(curve)) > LEGEND_WIDTH for curve in curves) else 2
-    figure = new_figure(6.4, 2.8 + 0.2 * math.ceil(len(curves) / columns))
+    figure = new_figure(6.4, 3.2 + 0.2 * math.ceil(len(curves) / columns))
     plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
     figure.legend(loc="outside upper center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK)
     return figure
