@@ -19,9 +19,6 @@ from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
 
 Array = NDArray[np.float64]
 
-LEGEND_WIDTH = 38
-"""Letters of a legend's longest line that leave room for a second column."""
-
 
 @dataclass(frozen=True)
 class Curve:
@@ -84,10 +81,14 @@ def draw_curves(
     curves: Sequence[Curve], *, xlabel: str = "environment steps", ylabel: str = "normalised return"
 ) -> Figure:
     """Draw curves as lines, each with the range of its seeds as a band around it, and a legend above."""
-    columns = 1 if any(len(_legend(curve)) > LEGEND_WIDTH for curve in curves) else 2
-    figure = new_figure(6.4, 3.2 + 0.2 * math.ceil(len(curves) / columns))
-    plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
-    figure.legend(loc="outside upper center", ncols=columns, frameon=False, fontsize=9, labelcolor=INK)
+    for columns in (2, 1):  # names may be too long for two
+        figure = new_figure(6.4, 3.2 + 0.2 * math.ceil(len(curves) / columns))
+        plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
+        style = {"frameon": False, "fontsize": 9, "labelcolor": INK}
+        legend = figure.legend(loc="outside upper center", ncols=columns, **style)
+        figure.draw_without_rendering()
+        if legend.get_window_extent().width <= figure.bbox.width:
+            break
     return figure
 
 
