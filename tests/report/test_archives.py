@@ -151,7 +151,23 @@ def test_the_table_of_ablations_has_a_row_for_each_variant(tmp_path, run_writers
         ["8", "multiplicative", "action", "gate and primitives", "75%", "0.850 (2)", ""],
         ["8", "additive", "weights", "gate", "", "0.650 (2)", ""],
     ]
-    assert len(cells_of((tmp_path / "results/heading_biped.md").read_text())) == 6
+    names = [row[0] for row in cells_of((tmp_path / "results/heading_biped.md").read_text())[1:]]
+    assert sorted(names) == [
+        "MCP, exploration=action",
+        "MCP, exploration=weights",
+        "MCP, mixer=additive, exploration=weights",
+        "MCP, num_primitives=4, exploration=weights",
+        "MCP, trained=gate and primitives, exploration=action",
+    ]
+
+
+def test_pretrainings_of_other_lengths_are_told_apart(tmp_path, run_writers, monkeypatch):
+    _, write_mcp = run_writers(tmp_path / "runs")
+    for name, steps in (("short", 3_000_000), ("long", 10_000_000)):
+        write_mcp(name, score=0.9, budget__pretrain=steps)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path / "results")
+    names = [row[0] for row in cells_of((tmp_path / "results/heading_biped.md").read_text())[1:]]
+    assert names == ["MCP, pre-trained 3 M", "MCP, pre-trained 10 M"]
 
 
 def test_the_published_runs_make_the_readmes_table(tmp_path, monkeypatch):
