@@ -20,6 +20,7 @@ from torchrl_mcp.training import checkpoint, collectors
 from torchrl_mcp.training.collectors import LocalSource, RemoteSource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Stopwatch
+from torchrl_mcp.training.threads import threads
 
 SMOKE = ["preset=smoke", "logger=none", "progress_bar=false"]
 ONE_STEP = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=384"]
@@ -121,9 +122,12 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     product = TensorDictModule(torch.nn.LazyLinear(1), in_keys=["observation"], out_keys=["product"])
     product(source.env.reset())
     policy, watch = TensorDictSequential(build.make_agent(cfg, source.env).actor.policy, product), Stopwatch()
-    source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=True, stopwatch=watch)
-    batch = source.collect()
-    source.stop()
+    with threads(3):  # the learner's, which workers do not diminish
+        source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=True, stopwatch=watch)
+        batch = source.collect()
+        during = torch.get_num_threads()
+        source.stop()
+        assert (during, torch.get_num_threads()) == (3, 3)
     assert batch.shape == (4, 20)
     assert batch["product"].dtype is torch.bfloat16
     for key in ("observation", "action"):

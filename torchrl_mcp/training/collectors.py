@@ -17,7 +17,7 @@ from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training import ray_agents
 from torchrl_mcp.training.progress import Stopwatch
-from torchrl_mcp.training.threads import threads
+from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, end, end_with_parent, new_workers
 
 Environments = CharacterEnv | TransformedCharacterEnv
@@ -213,7 +213,8 @@ class RemoteSource:
         self._watched = ExitStack()
         if self._backend["backend"] == "ray":
             self._watched.enter_context(ray_agents.watched())
-        with new_workers() as self._workers:
+        # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
+        with threads_kept(), new_workers() as self._workers:
             self._collector = Collector(
                 [partial(self._make_env, seed=int(seed)) for seed in seeds],
                 _Autocast(policy, device) if autocast else policy,
@@ -245,7 +246,8 @@ class RemoteSource:
     def stop(self) -> None:
         """Stop the workers, including those that hang."""
         try:
-            self._collector.shutdown(timeout=PATIENCE)
+            with threads_kept():
+                self._collector.shutdown(timeout=PATIENCE)
         finally:
             end(self._workers)
             self._watched.close()

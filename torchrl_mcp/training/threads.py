@@ -12,13 +12,20 @@ Result = TypeVar("Result")
 
 @contextmanager
 def threads(number: int) -> Iterator[None]:
-    """Let torch use ``number`` threads on the CPU while the block runs."""
+    """Let torch use ``number`` threads on the CPU while the block runs, and then as many as before."""
     before = torch.get_num_threads()
     torch.set_num_threads(number)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def threads_kept() -> Iterator[None]:
+    """Let torch have as many threads after the block as before it, whatever the block sets."""
+    with threads(torch.get_num_threads()):
+        yield
 
 
 def side_by_side(tasks: Mapping[str, Callable[[], Result]]) -> dict[str, Result]:
