@@ -2,6 +2,7 @@
 
 import csv
 import multiprocessing
+import shutil
 import subprocess
 import sys
 import time
@@ -69,7 +70,10 @@ def restored(folder):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return experiment.train(configure(tmp_path_factory.mktemp("run"), "collector=processes", *ONE_STEP))
+    every_checkpoint = ["checkpoint_interval=1", "keep_checkpoints=3"]
+    return experiment.train(
+        configure(tmp_path_factory.mktemp("run"), "collector=processes", *every_checkpoint, *ONE_STEP)
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -96,14 +100,12 @@ def test_the_noise_of_latents_comes_back_from_workers(tmp_path):
 
 
 def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path):
-    cfg = configure(tmp_path, "collector=processes", "checkpoint_interval=1", *ONE_STEP)
-    cfg.training.total_frames = 128
-    experiment.train(cfg)
-    path = tmp_path / "config.yaml"
-    path.write_text(path.read_text().replace("total_frames: 128", "total_frames: 384"))
-    experiment.resume(tmp_path)
-    resumed, whole = rows(tmp_path), rows(run)
-    assert not restored(tmp_path).episodes.lengths.any()  # of episodes that no one goes on with
+    folder = shutil.copytree(run, tmp_path / "run")
+    for name in ("checkpoint-000000000256.torchrl", "checkpoint-000000000384.torchrl"):
+        (folder / "checkpoints" / name).unlink()  # as if it had been killed in the second iteration
+    experiment.resume(folder)
+    resumed, whole = rows(folder), rows(run)
+    assert not restored(folder).episodes.lengths.any()  # of episodes that no one goes on with
     assert numbers(resumed[0]) == numbers(whole[0])
     assert [row["frames"] for row in resumed] == ["128", "256", "384"]
     assert resumed[1]["reward"] != whole[1]["reward"]
