@@ -85,15 +85,25 @@ def curve(metrics: Path) -> str:
 
 
 def write_tables(found: Sequence[Cell], output: Path) -> None:
-    """Write the table and the learning curves of each task, and the list of all runs."""
+    """Write the table and the learning curves of each task, and the list of all runs.
+
+    In a task, runs that go on for longer than others of the same methods are in the table alone.
+    """
     for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
         twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
         stem = output / "_".join([*place, stage] if twice else place)
         stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
-        curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in here})
+        drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
+        curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in drawn})
         save_figure(draw_curves(curves, ylabel="normalised return in training"), stem)
     write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
+
+
+def is_short(cell: Cell, others: Sequence[Cell]) -> bool:
+    """Return whether a cell has at most as many steps as any of the others whose method is not scratch."""
+    steps = [other.complete[0].total_frames for other in others if other.method != "scratch"]
+    return cell.complete[0].total_frames <= min(steps, default=0)
 
 
 def label(cell: Cell) -> str:

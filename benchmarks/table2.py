@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from archive import EMPTY, archived, average, score, write_tables
+from archive import EMPTY, archived, average, is_short, score, write_tables
 
 from torchrl_mcp.report.comparison import Cell
 from torchrl_mcp.report.paper import CHARACTERS, METHODS, PLACES, TABLE_2
@@ -52,13 +52,12 @@ def table_2(found: Sequence[Cell]) -> list[dict[str, Any]]:
     table = []
     for place in PLACES:
         here = [cell for cell in found if cell.place == place and cell.stage == "transfer" and cell.is_standard]
-        transfer = min((cell.complete[0].total_frames for cell in here if cell.method != "scratch"), default=0)
         best: dict[str, Cell] = {}
         for cell in here:
             column = title(cell.method)
-            if cell.complete[0].total_frames <= transfer:
-                column = SHORT if cell.method == "scratch" else column
-            elif cell.method != "scratch":
+            if cell.method == "scratch":
+                column = SHORT if is_short(cell, here) else column
+            elif not is_short(cell, here):
                 continue
             best[column] = max(best.get(column, cell), cell, key=lambda cell: average(cell.returns()))
         paper = {title(name): TABLE_2[*place, name].mean for name in METHODS if (*place, name) in TABLE_2}

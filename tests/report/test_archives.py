@@ -105,6 +105,8 @@ def test_every_task_has_a_table_and_curves(results):
     head, row = cells_of((results / "imitation_biped.md").read_text())
     assert dict(zip(head, row, strict=True))["completed"] == "75%"
     assert (results / "heading_biped.png").stat().st_size > 0
+    drawn = re.findall(r"<!-- (\w+), 0.0 M steps", (results / "heading_biped.svg").read_text())
+    assert drawn == ["Scratch", "Scratch", "MCP"]  # not MCP's longer run
     with (results / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 14  # seven runs in two modes
