@@ -105,12 +105,22 @@ def test_every_task_has_a_table_and_curves(results):
     head, row = cells_of((results / "imitation_biped.md").read_text())
     assert dict(zip(head, row, strict=True))["completed"] == "75%"
     assert (results / "heading_biped.png").stat().st_size > 0
-    drawn = re.findall(r"<!-- (\w+), 0.0 M steps", (results / "heading_biped.svg").read_text())
-    assert drawn == ["Scratch", "Scratch", "MCP"]  # not MCP's longer run
     with (results / "runs.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 14  # seven runs in two modes
     assert {row["commit"] for row in rows} == {"abc1234"}
+
+
+def test_a_run_that_goes_on_for_longer_is_in_the_table_and_not_among_the_curves(tmp_path, run_writers, monkeypatch):
+    write, write_mcp = run_writers(tmp_path / "runs")
+    write("scratch", score=0.8, total_frames=4_000_000)
+    for name, steps in (("short", 1_000_000), ("long", 4_000_000)):
+        write_mcp(name, score=0.9, total_frames=steps)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path / "results")
+    names = [row[0] for row in cells_of((tmp_path / "results/heading_biped.md").read_text())[1:]]
+    assert names == ["Scratch", "MCP, 1.0 M steps", "MCP, 4.0 M steps"]
+    drawn = (tmp_path / "results/heading_biped.svg").read_text()
+    assert [f"<!-- {name} -->" in drawn for name in names] == [True, True, False]
 
 
 def test_the_archive_gives_the_same_results_again(results, tmp_path, monkeypatch):
