@@ -87,7 +87,8 @@ def curve(metrics: Path) -> str:
 def write_tables(found: Sequence[Cell], output: Path) -> None:
     """Write the table and the learning curves of each task, and the list of all runs.
 
-    In a task, runs that go on for longer than others of the same methods are in the table alone.
+    In a task, runs with more steps than the shortest that is not scratch are in the table alone; all of scratch's are
+    among the curves.
     """
     for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
