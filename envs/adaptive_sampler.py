@@ -21,7 +21,8 @@ class AdaptiveSampler:
     .. math:: P(j) \propto W_j \lambda_j
 
     where :math:`\lambda_j` is the recent share of steps in period j that ended an episode, and :math:`W_j` the
-    probability with which the library draws the period. A moment is uniform over the period and the second before it.
+    probability with which the library draws the period. A start is up to a second before a moment of the period, both
+    uniform. Starts before the beginning of a clip wrap around if it loops, and are its beginning otherwise.
 
     Args:
         library: The reference motions.
@@ -33,8 +34,8 @@ class AdaptiveSampler:
         self._first = numbers.cumsum(0) - numbers
         self._begins = PERIOD * (torch.arange(len(self._clips)).to(numbers.device) - self._first[self._clips])
         self._durations, self._loops = library.durations, library.loops
-        lasts = (library.durations[self._clips] - self._begins).clamp_max(PERIOD)
-        self._weights = (library.weights / library.durations)[self._clips] * lasts
+        self._lasts = (library.durations[self._clips] - self._begins).clamp_max(PERIOD)
+        self._weights = (library.weights / library.durations)[self._clips] * self._lasts
         self.steps = torch.full_like(self._weights, PRIOR_STEPS)
         self.failures = torch.full_like(self._weights, PRIOR_FAILURES)
 
@@ -54,14 +55,14 @@ class AdaptiveSampler:
         self.steps, self.failures = DECAY * self.steps + steps, DECAY * self.failures + failures
 
     def draw(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw moments: clips ``(num,)``, int64, and times in seconds ``(num,)``, float64."""
+        """Draw starts: clips ``(num,)``, int64, and times in seconds ``(num,)``, float64."""
         periods = torch.multinomial(
             self._weights * self.failures / self.steps, num, replacement=True, generator=generator
         )
         clips = self._clips[periods]
         ahead, lead = torch.rand(2, num, generator=generator, dtype=torch.float64, device=clips.device)
-        times = self._begins[periods] + PERIOD * (ahead - lead)
-        return clips, times.clamp_min(0.0).minimum(self._durations[clips])
+        times = self._begins[periods] + self._lasts[periods] * ahead - PERIOD * lead
+        return clips, torch.where(self._loops[clips], times % self._durations[clips], times.clamp_min(0.0))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the counts."""

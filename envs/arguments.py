@@ -28,3 +28,14 @@ def not_negative(**values: float) -> None:
     for name, value in values.items():
         if not 0.0 <= value < math.inf:
             raise ValueError(f"{name}={value} is out of range: pass a finite number of at least 0")
+
+
+def positive(**values: float) -> None:
+    """Check that values are finite and above 0.
+
+    Raises:
+        ValueError: If one is not, with its name.
+    """
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"{name}={value} is out of range: pass a finite number above 0")

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.rendering import Arrow
@@ -56,7 +56,8 @@ class Heading(TransferTask):
         max_episode_steps: int = 600,
         **kwargs: Any,
     ) -> None:
-        not_negative(max_turn=max_turn, speed=speed)
+        not_negative(max_turn=max_turn)
+        positive(speed=speed)
         self.max_turn, self.speed = max_turn, speed
         super().__init__(
             character,

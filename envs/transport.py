@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.goals import POSITIONS, goal_layout, logarithmic
 from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.mirror import BODY_SIGNS, Mirror, mirror_signs
@@ -98,7 +98,7 @@ class Transport(TransferTask):
         episode: Mapping[str, Tensor] | None = None,
         **kwargs: Any,
     ) -> None:
-        not_negative(speed=speed)
+        positive(speed=speed)
         if target_distance_power not in (1, 2):
             raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
         if goal_positions not in POSITIONS:

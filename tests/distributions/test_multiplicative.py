@@ -118,6 +118,16 @@ def test_all_gates_closed_leave_the_documented_broad_gaussian():
     assert policy.sample((1000,)).half().isfinite().all()
 
 
+@pytest.mark.parametrize("scale", [1e-16, 1e-25, 1e-38])
+def test_a_closed_primitive_however_narrow_leaves_the_others_as_they_are(scale):
+    loc = torch.tensor([[3.0], [1.0]], requires_grad=True)
+    for gates, mean, stddev in ((torch.tensor([0.0, 1.0]), 1.0, 2.0), (torch.zeros(2), 0.0, 1e4)):
+        policy = MultiplicativeGaussian(loc, torch.tensor([[scale], [2.0]]), gates.requires_grad_())
+        assert (policy.mean.item(), policy.stddev.item()) == pytest.approx((mean, stddev))
+        policy.log_prob(torch.ones(1)).backward()
+        assert loc.grad.isfinite().all()
+
+
 def test_the_floor_on_the_precision_is_reached_without_a_jump():
     loc, scale = torch.full((1, 1), 3.0, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
     above, below = (MultiplicativeGaussian(loc, scale, torch.tensor([1e-8 * r])) for r in (1.001, 0.999))

@@ -45,3 +45,14 @@ def test_failures_are_forgotten_in_a_hundred_seconds(sampler):
         sampler.count(torch.tensor([1]), time, torch.tensor([False]))
     assert sampler.failures[0].item() == pytest.approx(failures * 0.9997**3000)
     assert sampler.steps[0].item() == pytest.approx(steps * 0.9997**3000)
+
+
+def test_starts_are_uniform_over_a_loop_and_pile_up_at_the_beginning_of_other_clips_alone():
+    rest = torch.from_numpy(CHARACTERS["biped"].spec().compile().qpos0).repeat(37, 1)
+    clips = {name: MotionClip("biped", rest, 30.0, loop=name == "loop") for name in ("loop", "once")}
+    loop, once = moments(AdaptiveSampler(MotionLibrary(clips)))
+    sixths = torch.histc(loop, 6, 0.0, 1.2) / len(loop)
+    torch.testing.assert_close(sixths, torch.full_like(sixths, 1 / 6), rtol=0, atol=0.01)
+    # A moment m is uniform over 1.2 s, and its lead over 1 s is longer than m with probability (1 - m), below 1.
+    assert (once == 0).double().mean().item() == pytest.approx(0.5 / 1.2, abs=0.01)
+    assert 1.18 < once.max() < 1.2

@@ -52,5 +52,7 @@ def test_episodes_begin_early_enough_to_end_within_the_clip():
 def test_changing_references_and_uneven_numbers_are_refused():
     with pytest.raises(ValueError, match="switch_interval=inf"):
         follow_each(IDLE, make(switch_interval=5.0))
+    with pytest.raises(ValueError, match="clip_end='truncate'"):
+        follow_each(IDLE, make(clip_end="switch"))
     with pytest.raises(ValueError, match="num_envs=7 is no multiple of the number of clips, 3"):
         follow_each(IDLE, make(7))

@@ -98,6 +98,16 @@ def test_transfer_of_options_trains_their_values_alone(tmp_path, pretrained):
         assert torch.equal(before[name], after[name]) == (name.startswith(kept) and not changed), name
 
 
+def test_transfer_with_frozen_terminations_trains_options_and_values(tmp_path, pretrained):
+    folder = tmp_path / "run"
+    settings = ["stage=transfer", f"pretrained={pretrained['option_critic']}", "training.total_frames=256"]
+    settings += ["transfer.freeze=[terminations,observation_normaliser]"]
+    experiment.train(configure(folder, "option_critic", *settings))
+    before, after = final_parts(pretrained["option_critic"]), final_parts(folder)
+    changed = {name.partition(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"options", "critic", "goal_normaliser"}
+
+
 def test_all_primitives_learn_in_one_run(pretrained):
     cfg, agent, _ = policies.restore(pretrained["hierarchical"], num_envs=1, seed=0)
     torch.manual_seed(cfg.seed)

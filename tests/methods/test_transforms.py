@@ -153,6 +153,14 @@ def test_environments_with_a_memory_are_put_into_a_state_and_saved_as_a_whole():
     assert continued["held_steps"][:, 0].tolist() == [1, 1]
 
 
+def test_a_state_for_some_environments_leaves_the_options_of_the_others():
+    env = TransformedCharacterEnv(Holdout(num_envs=3, directions=[0.0, 1.0], seed=0), OptionMemory())
+    held = env.rollout(5, counting_ants)["next", "held_option"][:, -1]
+    assert held.all()
+    env.reset(env.get_state().set("_reset", torch.tensor([[True], [False], [False]])), set_state=True)
+    assert env.transform.get_extra_state()["held_option"].tolist() == [0, *held[1:].tolist()]
+
+
 def counting_ants(tensordict):
     """As :func:`counting`, for ants."""
     return counting(tensordict).set("action", torch.full((*tensordict.batch_size, 8), 0.1))

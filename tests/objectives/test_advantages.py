@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives.value import GAE
 
-from torchrl_mcp.objectives import Advantages
+from torchrl_mcp.objectives import Advantages, OptionAdvantages, SemiMarkovAdvantages
 
 CONTINUES, TERMINATED, TRUNCATED, BOTH = range(4)
 
@@ -205,3 +205,14 @@ def test_in_autocast_the_estimates_stay_float32():
     with torch.autocast("cpu", torch.bfloat16):
         Advantages(module, gamma=0.95, lmbda=0.95, clip=4.0)(batch)
     assert all(batch[key].dtype == torch.float32 for key in ("advantage", "value_target", "state_value"))
+
+
+def option_advantages(critic, **kwargs):
+    return OptionAdvantages(critic, epsilon=0.1, termination_cost=0.01, **kwargs)
+
+
+@pytest.mark.parametrize("estimator", [Advantages, SemiMarkovAdvantages, option_advantages])
+@pytest.mark.parametrize("gamma", [1.0, 1.5, -0.1])
+def test_without_a_discount_no_reward_would_be_left_so_it_is_refused(estimator, gamma):
+    with pytest.raises(ValueError, match=f"gamma={gamma} must be at least 0 and below 1"):
+        estimator(critic(), gamma=gamma, lmbda=0.9, clip=4.0)

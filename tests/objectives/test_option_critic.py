@@ -140,6 +140,21 @@ def test_frozen_options_leave_the_values_alone_to_learn():
     assert list(report.keys()) == loss.out_keys == ["loss_critic"]
 
 
+def test_frozen_terminations_leave_the_options_to_learn():
+    options = Options()
+    samples, whole = exact_samples(Problem(), options, 0), tabular_loss(options)
+    acting = TensorDictModule(
+        lambda state, option: options.policies[option, state], in_keys=["observation", "option"], out_keys=["logits"]
+    )
+    actor = ProbabilisticTensorDictSequential(acting, whole.actor_network[-1])
+    actor.policies = options.policies
+    loss = OptionCriticLoss(actor, whole.critic_network, clip_epsilon=0.2, bound_coeff=0.0)
+    report, expected = loss(samples), whole(samples)
+    assert list(report.keys()) == loss.out_keys == [key for key in whole.out_keys if key != "loss_termination"]
+    for key, value in report.items():
+        assert torch.equal(value, expected[key]), key
+
+
 def test_without_a_critic_the_terms_of_the_options_are_left():
     options = Options()
     samples, whole = exact_samples(Problem(), options, 0), tabular_loss(options)

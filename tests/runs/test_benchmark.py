@@ -300,3 +300,8 @@ def test_the_slurm_launcher_composes_and_queues_again_what_reached_its_time_limi
     assert launcher["_target_"].endswith("SlurmLauncher")
     assert launcher.partition == "long"
     assert launcher.max_num_timeout > 0
+
+
+def test_rows_with_numbers_are_selected_by_the_command_line():
+    rows = [{"num_primitives": [4, 8]}]
+    assert list(benchmark.expand(rows, {"num_primitives": ["4"]})) == [{"num_primitives": "4"}]

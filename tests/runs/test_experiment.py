@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from torch import nn
@@ -77,7 +78,7 @@ def test_evaluation_reports_as_many_episodes_as_asked_and_writes_them_down(comma
         (["exploration=weights"], "stage=transfer"),
         (
             ["resume=nowhere", "device=cuda"],
-            "leave out preset=smoke logger=none num_threads=1 progress_bar=false device=cuda",
+            "leave out preset=smoke logger=none num_threads=1 progress_bar=false",
         ),
         (["training.minibatch_size=100"], "multiple"),
         (["num_primitives=0"], "num_primitives=0 must be a whole number, at least 1"),
@@ -98,6 +99,31 @@ def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(comm
     assert outcome.returncode != 0
     assert "resume=" in outcome.stderr
     assert contents(run) == before
+
+
+def test_a_folder_with_checkpoints_of_a_run_without_its_configuration_is_refused(run, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (copy / "config.yaml").unlink()
+    before = contents(copy)
+    with pytest.raises(ValueError, match=r"config\.yaml is missing: put that back to continue the run"):
+        experiment.train(configure(*FAST, f"run_dir={copy}"))
+    assert contents(copy) == before
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_run_of_a_gpu_goes_on_without_one_if_told_to(run, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    cfg = OmegaConf.load(copy / "config.yaml")
+    cfg.device, cfg.training.total_frames = "cuda", 2 * cfg.training.total_frames
+    OmegaConf.save(cfg, copy / "config.yaml")
+    before = contents(copy)
+    with pytest.raises(ValueError, match=r"finds no CUDA device. Pass device=cpu"):
+        experiment.resume(copy)
+    assert contents(copy) == before
+    experiment.resume(copy, device="cpu")
+    assert experiment.is_complete(copy)
 
 
 def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):

@@ -12,6 +12,7 @@ from torch import nn
 from torchrl import torchrl_logger
 
 from torchrl_mcp.training.checkpoint import (
+    RunRandomness,
     find,
     load,
     load_parts,
@@ -180,3 +181,21 @@ def test_only_another_version_of_torch_is_warned_of_and_not_another_build(saved_
     finally:
         torchrl_logger.removeHandler(handler)
     assert any("version skew" in message for message in messages) == warned
+
+
+def test_random_states_of_a_run_on_gpus_are_restored_without_them():
+    here = RunRandomness(torch.device("cpu"))
+    elsewhere = here.state_dict() | {"torch_cuda": [torch.get_rng_state()] * 8, "cuda": torch.get_rng_state()}
+    expected = torch.rand(3)
+    here.load_state_dict(elsewhere)
+    assert torch.equal(torch.rand(3), expected)
+    assert not {"cuda", "torch_cuda"} & set(here.state_dict())
+
+
+def test_the_random_state_of_the_own_gpu_is_saved_and_restored_alone(monkeypatch):
+    states = {torch.device("cuda", index): torch.full((2,), index) for index in range(4)}
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: states[device].clone())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: states.update({device: state}))
+    saved = RunRandomness(torch.device("cuda", 3)).state_dict()
+    RunRandomness(torch.device("cuda", 0)).load_state_dict(saved)
+    assert [state[0].item() for state in states.values()] == [3, 1, 2, 3]

@@ -1,5 +1,6 @@
 import json
 import os
+import sys
 import tempfile
 
 import pytest
@@ -44,6 +45,16 @@ def test_the_content_is_on_the_disk_before_it_gets_its_name_and_then_the_name_is
     with replacing(file) as partial:
         partial.write_text("new")
     assert flushed == [(file.stat().st_ino, False), (tmp_path.stat().st_ino, True)]
+
+
+def test_where_folders_cannot_be_flushed_files_still_are(tmp_path, monkeypatch):
+    flushed, flush = [], os.fsync
+    monkeypatch.setattr(os, "fsync", lambda descriptor: flushed.append(descriptor) or flush(descriptor))
+    monkeypatch.setattr(sys, "platform", "win32")
+    with replacing(tmp_path / "numbers.csv") as partial:
+        partial.write_text("new")
+    assert len(flushed) == 1
+    assert (tmp_path / "numbers.csv").read_text() == "new"
 
 
 def test_json_is_written_into_folders_that_are_made(tmp_path):

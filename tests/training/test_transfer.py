@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.training.transfer import FrozenParts, fingerprint, require_parts
+from torchrl_mcp.training.transfer import FrozenParts, fingerprint, require_frozen_input, require_parts
 
 
 def make():
@@ -121,3 +121,27 @@ def test_the_fingerprint_depends_on_names_and_on_nothing_else():
     twin.load_state_dict(layer.state_dict())
     assert fingerprint(layer) == fingerprint(twin)
     assert fingerprint(layer) == fingerprint(twin.requires_grad_(False).eval())
+
+
+NETWORKS = ["primitives", "observation_normaliser"]
+
+
+@pytest.mark.parametrize(
+    ("keep", "freeze", "message"),
+    [
+        (NETWORKS, ["primitives"], r"freeze names \['primitives'\].*add it to transfer\.freeze"),
+        (["primitives"], NETWORKS, r"transfer\.keep names parts that need the observation_normaliser"),
+        (NETWORKS, [*NETWORKS, "critic"], r"transfer\.freeze names the critic"),
+    ],
+    ids=["normaliser not frozen", "normaliser not kept", "critic frozen"],
+)
+def test_frozen_networks_whose_inputs_would_change_are_refused(keep, freeze, message):
+    with pytest.raises(ValueError, match=message):
+        require_frozen_input(make(), keep, freeze)
+
+
+@pytest.mark.parametrize(
+    ("keep", "freeze"), [(NETWORKS, NETWORKS), (NETWORKS, NETWORKS[1:]), (NETWORKS, []), ([], []), ([], NETWORKS)]
+)
+def test_networks_are_frozen_with_their_normaliser_or_not_at_all(keep, freeze):
+    require_frozen_input(make(), keep, freeze)

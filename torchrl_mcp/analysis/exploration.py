@@ -56,7 +56,7 @@ def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> 
         std: Standard deviation of the noise, in action units.
         generator: Source of randomness.
     """
-    return lambda state: std * torch.randn(len(state), action_dim, generator=generator)
+    return lambda state: std * torch.randn(len(state), action_dim, generator=generator, device=generator.device)
 
 
 def explore(

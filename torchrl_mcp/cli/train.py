@@ -21,7 +21,7 @@ SETTINGS = {
     "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
     "seed=N": "seed of networks, environments and sampling (default 0)",
     "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
-    "resume=FOLDER": "run folder to continue; takes no other settings",
+    "resume=FOLDER": "run folder to continue; takes no other setting than device",
     "training.total_frames=N": "environment steps",
     "device=cuda": "networks on a GPU; physics stays on the CPU",
     "physics=warp": "with device=cuda, physics on the GPU as well, by the extra torchrl-mcp[warp]",

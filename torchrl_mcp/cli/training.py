@@ -36,7 +36,7 @@ def train(cfg: DictConfig) -> float | None:
     from torchrl_mcp.runs import experiment
 
     try:
-        folder = _resume(Path(cfg.resume)) if cfg.resume else experiment.train(cfg)
+        folder = _resume(cfg) if cfg.resume else experiment.train(cfg)
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except HydraException as error:
@@ -80,12 +80,13 @@ def run_benchmark(arguments: list[str]) -> None:
         sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
 
 
-def _resume(folder: Path) -> Path:
+def _resume(cfg: DictConfig) -> Path:
     from torchrl_mcp.runs import experiment
 
-    given = HydraConfig.get().overrides.task
-    if ignored := [setting for setting in given if not setting.startswith("resume=")]:
-        raise ValueError(f"a resumed run keeps its settings: leave out {' '.join(ignored)}")
+    folder, given = Path(cfg.resume), HydraConfig.get().overrides.task
+    device = cfg.device if any(setting.startswith("device=") for setting in given) else None
+    if ignored := [setting for setting in given if not setting.startswith(("resume=", "device="))]:
+        raise ValueError(f"a resumed run keeps its settings, except for the device: leave out {' '.join(ignored)}")
     if experiment.is_complete(folder):
         print(f"{folder} is complete: nothing is left to do")
-    return experiment.resume(folder)
+    return experiment.resume(folder, device=device)

@@ -62,7 +62,8 @@ class MultiplicativeGaussian(Independent):
         log_precision = -2 * scale.log()
         # log sum_k w_k exp(x_k) around an anchor that cancels: unlike logsumexp(log w + x), it has a gradient at w = 0.
         anchor = (gates.log() + log_precision).amax(-2, keepdim=True).clamp_min(LOG_PRECISION_FLOOR).detach()
-        weights = gates * (log_precision - anchor).exp()
+        # An exponent above 80 belongs to a closed gate, and would make its weight 0 * inf.
+        weights = gates * (log_precision - anchor).clamp_max(80.0).exp()
         total = weights.sum(-2, keepdim=True).clamp_min((LOG_PRECISION_FLOOR - anchor).exp())
         mean = (weights / total * loc).sum(-2)
         stddev = (-(anchor + total.log()) / 2).exp().squeeze(-2)

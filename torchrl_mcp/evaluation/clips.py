@@ -48,15 +48,19 @@ def follow_each(
         ValueError: If the reference may change, or the clips do not divide the environments.
     """
     library, count = env.library, len(env.library)
-    if env.switch_probability:
-        raise ValueError("the reference changes within an episode: make the environment with switch_interval=inf")
+    if env.switch_probability or env.clip_end != "truncate":
+        raise ValueError(
+            "the reference changes within an episode: make the environment with switch_interval=inf and "
+            "clip_end='truncate'"
+        )
     if env.num_envs % count:
         raise ValueError(f"num_envs={env.num_envs} is no multiple of the number of clips, {count}")
     episodes = env.num_envs // count
     needed = (env.max_episode_steps + 2) * env.control_timestep
     latest = torch.where(library.loops | (library.durations < needed), library.durations, library.durations - needed)
-    clips = torch.arange(count).repeat_interleave(episodes)
-    times = latest[clips] * ((torch.arange(episodes, dtype=torch.float64) + 0.5) / episodes).repeat(count)
+    clips = torch.arange(count, device=env.device).repeat_interleave(episodes)
+    shares = (torch.arange(episodes, dtype=torch.float64, device=env.device) + 0.5) / episodes
+    times = latest[clips] * shares.repeat(count)
     env.reset()
     start = env.get_state().update(TensorDict(env.beginning(clips, times), env.batch_size))
     outcome = evaluate(policy, env, start=start, deterministic=deterministic, device=device)

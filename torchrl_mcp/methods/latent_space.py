@@ -104,5 +104,5 @@ def random_latents(parts: nn.ModuleDict, num: int, generator: torch.Generator, *
         generator: Source of randomness.
         latent_dim: Size of the latent variable, ``L``.
     """
-    latent = torch.randn(num, latent_dim, generator=generator)
+    latent = torch.randn(num, latent_dim, generator=generator, device=generator.device)
     return lambda state: parts["decoder"](state, latent)[0]

@@ -191,7 +191,7 @@ def random_weights(
         distribution_class: The mixer, of ``(loc, scale, gates)``.
     """
     # Paper: Gaussian weights. Here Gaussian logits, as with exploration=weights, so that weights are between 0 and 1.
-    gates = gate_activation(torch.randn(num, num_primitives, generator=generator))
+    gates = gate_activation(torch.randn(num, num_primitives, generator=generator, device=generator.device))
     composite = DeterministicAction(distribution_class)
 
     def explore(state: Tensor) -> Tensor:

@@ -129,12 +129,13 @@ class RandomSequence:
     ) -> None:
         self._options, self._num, self._generator = options, num, generator
         self._num_options, self._steps = num_options, steps
-        self._elapsed, self._option = 0, torch.zeros(num, dtype=torch.int64)
+        self._elapsed, self._option = 0, torch.zeros(num, dtype=torch.int64, device=generator.device)
 
     def __call__(self, state: Tensor) -> Tensor:
         """Return the actions of the next step, ``(N, A)``, from states ``(N, S)``."""
         if self._elapsed % self._steps == 0:
-            self._option = torch.randint(self._num_options, (self._num,), generator=self._generator)
+            device = self._generator.device
+            self._option = torch.randint(self._num_options, (self._num,), generator=self._generator, device=device)
         self._elapsed += 1
         return self._options(state, self._option)[0]
 

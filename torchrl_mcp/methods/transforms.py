@@ -33,7 +33,8 @@ class TransformedCharacterEnv(TransformedEnv):
         if not kwargs.get("set_state"):
             return super()._reset(tensordict, **kwargs)
         began = self.base_env._reset(tensordict, **kwargs)
-        return self.transform._reset(began.empty(), began)
+        which = began.empty() if tensordict is None else tensordict.select("_reset", strict=False)
+        return self.transform._reset(which, began)
 
 
 class OptionMemory(Transform):

@@ -22,6 +22,9 @@ class Advantages:
         lmbda: Decay of both estimators.
         clip: Largest absolute advantage after normalisation to zero mean and unit variance.
 
+    Raises:
+        ValueError: If ``gamma`` is not at least 0 and below 1.
+
     Reference:
         Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage Estimation*, 2016.
     """
@@ -30,7 +33,7 @@ class Advantages:
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
         self.critic = critic
-        self.reward_scale = 1 - gamma
+        self.reward_scale = reward_scale(gamma)
         self.clip = clip
         self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
@@ -55,3 +58,14 @@ class Advantages:
         batch["value_target"] = trajectories["value_target"]
         batch["state_value"] = value
         return batch
+
+
+def reward_scale(gamma: float) -> float:
+    r"""Return the factor on rewards that gives returns the size of a reward, :math:`1 - \gamma`.
+
+    Raises:
+        ValueError: If ``gamma`` is not at least 0 and below 1: at 1 all rewards would be 0.
+    """
+    if not 0 <= gamma < 1:
+        raise ValueError(f"gamma={gamma} must be at least 0 and below 1: rewards are scaled by 1 - gamma")
+    return 1 - gamma

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
+from torchrl_mcp.objectives.advantages import reward_scale
 from torchrl_mcp.objectives.values import ValueLoss
 
 
@@ -41,6 +42,9 @@ class OptionAdvantages:
         epsilon: Probability of a random choice in the policy over options, :math:`\pi_\Omega`.
         termination_cost: :math:`\xi`, which keeps options from ending at every step.
 
+    Raises:
+        ValueError: If ``gamma`` is not at least 0 and below 1.
+
     Reference:
         Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017. https://arxiv.org/abs/1609.05140
     """
@@ -58,7 +62,7 @@ class OptionAdvantages:
         termination_cost: float,
     ) -> None:
         self.critic = critic
-        self.reward_scale, self.clip = 1 - gamma, clip
+        self.reward_scale, self.clip = reward_scale(gamma), clip
         self.epsilon, self.termination_cost = epsilon, termination_cost
         self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
@@ -126,7 +130,8 @@ class OptionCriticLoss(LossModule):
     with :math:`\rho = \pi_\omega(a|s) / \pi_\omega^{\mathrm{old}}(a|s)`. Samples that are used once have
     :math:`\rho = 1`, and the gradients of the first three terms are those of the intra-option policy gradient theorem,
     of the termination gradient theorem and of intra-option Q-learning; the clipped ratio lets samples be used several
-    times. If the options are frozen, only the third term remains.
+    times. If the options and terminations are frozen, only the third term remains; if the terminations alone are,
+    ``actor_network`` leaves ``termination`` out, and so does the loss.
 
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
@@ -190,7 +195,8 @@ class OptionCriticLoss(LossModule):
         critic = [] if self.critic_network is None else ["loss_critic"]
         if not self._learns_options():
             return critic
-        losses = [*critic, "loss_objective", "loss_termination", "loss_bound"]
+        terminations = ["loss_termination"] if self._learns_terminations() else []
+        losses = [*critic, "loss_objective", *terminations, "loss_bound"]
         return [*losses, "kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
 
     @dispatch
@@ -216,13 +222,12 @@ class OptionCriticLoss(LossModule):
         log_ratio = distribution.log_prob(tensordict[keys.action]) - tensordict[keys.sample_log_prob]
         ratio, advantage = log_ratio.exp(), tensordict[keys.advantage].squeeze(-1)
         clipped = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
-        regret = tensordict[keys.termination_advantage].squeeze(-1)
-        return {
-            "loss_objective": -torch.minimum(ratio * advantage, clipped * advantage).mean(),
-            "loss_termination": (outputs[keys.termination] * regret).mean(),
-            "loss_bound": self._bound_penalty(distribution, advantage),
-            **_update_report(log_ratio.detach(), self.clip_epsilon),
-        }
+        terms = {"loss_objective": -torch.minimum(ratio * advantage, clipped * advantage).mean()}
+        if self._learns_terminations():
+            regret = tensordict[keys.termination_advantage].squeeze(-1)
+            terms["loss_termination"] = (outputs[keys.termination] * regret).mean()
+        bound = self._bound_penalty(distribution, advantage)
+        return {**terms, "loss_bound": bound, **_update_report(log_ratio.detach(), self.clip_epsilon)}
 
     def _bound_penalty(self, distribution: Any, like: Tensor) -> Tensor:
         if not self.bound_coeff:
@@ -232,6 +237,9 @@ class OptionCriticLoss(LossModule):
 
     def _learns_options(self) -> bool:
         return any(parameter.requires_grad for parameter in self.actor_network.parameters())
+
+    def _learns_terminations(self) -> bool:
+        return self.tensor_keys.termination in self.actor_network.out_keys
 
 
 def _update_report(log_ratio: Tensor, clip_epsilon: float) -> dict[str, Tensor]:

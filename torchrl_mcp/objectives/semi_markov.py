@@ -5,6 +5,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_mcp.objectives.advantages import reward_scale
+
 
 class SemiMarkovAdvantages:
     r"""GAE(:math:`\lambda`) and TD(:math:`\lambda`) targets for choices that last several steps.
@@ -28,6 +30,9 @@ class SemiMarkovAdvantages:
         lmbda: Decay of both estimators, from choice to choice.
         clip: Largest absolute advantage after normalisation to zero mean and unit variance.
 
+    Raises:
+        ValueError: If ``gamma`` is not at least 0 and below 1.
+
     Reference:
         Sutton, Precup and Singh, *Between MDPs and semi-MDPs: A framework for temporal abstraction in reinforcement
         learning*, 1999. https://doi.org/10.1016/S0004-3702(99)00052-1
@@ -37,6 +42,7 @@ class SemiMarkovAdvantages:
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
         self.critic, self.gamma, self.lmbda, self.clip = critic, gamma, lmbda, clip
+        self.reward_scale = reward_scale(gamma)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
@@ -73,7 +79,7 @@ class SemiMarkovAdvantages:
         next_value[cut] = self._values(batch["next"][cut])
         lmbda = self.lmbda * (~stops).float()
         ends = stops | batch["begins"].roll(-1, dims=1)
-        reward = (1 - self.gamma) * batch["next", "reward"].squeeze(-1)
+        reward = self.reward_scale * batch["next", "reward"].squeeze(-1)
         target = torch.empty_like(value)
         later = torch.zeros_like(value[:, 0])
         for t in reversed(range(batch.shape[1])):

@@ -124,7 +124,8 @@ def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Se
     [{'task': 'carry', 'seed': '0'}, {'task': 'carry', 'seed': '1'}]
     """
     for row in rows:
-        selected = {key: [value for value in row[key] if value in choices.get(key, row[key])] for key in row}
+        fixed = {key: [str(value) for value in row[key]] for key in row}
+        selected = {key: [value for value in fixed[key] if value in choices.get(key, fixed[key])] for key in row}
         others = {key: choice for key, choice in choices.items() if key not in row}
         for combination in product(*selected.values(), *others.values()):
             yield dict(zip([*selected, *others], combination, strict=True))

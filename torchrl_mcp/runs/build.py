@@ -36,7 +36,7 @@ from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.trainer import Trainer
-from torchrl_mcp.training.transfer import FrozenParts, require_parts
+from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,8 @@ def require_equipment(cfg: DictConfig) -> None:
         kind_of_device = torch.device(cfg.device).type
     except RuntimeError as error:
         raise ValueError(f"torch does not know device={cfg.device}: pass cpu or cuda") from error
+    if kind_of_device == "mps":
+        raise ValueError(f"device={cfg.device} has no float64, which normalisers count in: pass cpu or cuda")
     if kind_of_device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
@@ -163,6 +165,10 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
 
     If the checkpoint file ``pretrained`` is given, the parts that transfer keeps are loaded from it; in pre-training,
     all parts in the file are.
+
+    Raises:
+        ValueError: If the parts that transfer keeps or freezes are unknown or do not go together, or the file does not
+            fit.
     """
     sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
     parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
@@ -174,6 +180,7 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze
+        require_frozen_input(parts, cfg.transfer.keep, names)
     frozen = FrozenParts(parts, names)
     actor = instantiate(cfg.actor)(parts, frozen=names)
     critic = instantiate(cfg.critic)(parts, sizes["observation"], sizes["goal"])

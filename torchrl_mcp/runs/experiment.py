@@ -38,25 +38,30 @@ def train(cfg: DictConfig) -> Path:
         return _train(cfg)
 
 
-def resume(folder: Path) -> Path:
+def resume(folder: Path, *, device: str | None = None) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with its own configuration.
 
     A run that :func:`is_complete` is not changed. On another machine a run keeps its precision.
 
+    Args:
+        folder: The run folder.
+        device: Device to go on with, or None for the run's own.
+
     Raises:
-        ValueError: If the folder holds no run, another process uses it, or its checkpoint is damaged.
+        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, or this machine
+            lacks the device or the logger.
     """
     if is_complete(folder):
         return folder
     with _held(folder):
-        return _resume(folder)
+        return _resume(folder, device)
 
 
 def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
     """Train as configured, or resume the run if it has begun; return the folder.
 
     Args:
-        cfg: The configuration. A resumed run keeps its own.
+        cfg: The configuration. A resumed run keeps its own, except for the device.
         wait: If another process uses the run folder, wait for it.
 
     Raises:
@@ -65,7 +70,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
     folder = Path(cfg.run_dir)
     _require(cfg)
     with _held(folder, wait=wait), trusting(build.named(cfg)):
-        return _resume(folder) if (folder / CONFIG).exists() else _train(cfg)
+        return _resume(folder, cfg.device) if (folder / CONFIG).exists() else _train(cfg)
 
 
 def settled(cfg: DictConfig) -> DictConfig:
@@ -128,6 +133,11 @@ def _train(cfg: DictConfig) -> Path:
     folder = Path(cfg.run_dir)
     if (folder / CONFIG).exists():
         raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
+    if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
+        raise ValueError(
+            f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: put that back to continue the "
+            "run, or give another run_dir"
+        )
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
     print(f"{folder}: {precision}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(settled(cfg), {"autocast": precision.autocast}))
@@ -141,10 +151,12 @@ def _train(cfg: DictConfig) -> Path:
     return folder
 
 
-def _resume(folder: Path) -> Path:
+def _resume(folder: Path, device: str | None = None) -> Path:
     if is_complete(folder):
         return folder
     cfg = run_config(folder)
+    cfg.device = device or cfg.device
+    build.require_equipment(cfg)
     print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
     trainer = _restored(cfg, folder)
     (folder / EVALUATION).unlink(missing_ok=True)

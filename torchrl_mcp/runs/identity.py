@@ -12,7 +12,7 @@ CONDUCT = frozenset(
         *("num_threads", "progress_bar", "record_interval", "recorder", "resume", "torch_threads"),
     }
 )
-"""Settings of how a run is executed. They may change when it is resumed; a local ``collector`` stays local."""
+"""Settings of how a run is executed: they make no other run. A resumed run keeps its own, except for ``device``."""
 
 PLACES = frozenset({"pretrained", "run_dir", "run_root"})
 """Settings of where a run is stored, and where its transferred parts come from."""

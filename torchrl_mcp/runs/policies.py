@@ -144,5 +144,7 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
     _, _, env = restore(path, num_envs=1, seed=seed)
     if not hasattr(env, "library"):
         raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
-    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, switch_interval=math.inf)
+    num_envs = episodes * len(env.library)
+    # An episode follows one clip, and ends with it.
+    _, agent, env = restore(path, num_envs=num_envs, seed=seed, switch_interval=math.inf, clip_end="truncate")
     return follow_each(agent.actor.policy, env)

@@ -49,10 +49,13 @@ SEED = Rule(f"a whole number from 0 to {SEEDS - 1}", lambda value: _is_whole(val
 POSITIVE = Rule("a finite number above 0", lambda value: _is_number(value) and value > 0)
 NOT_NEGATIVE = Rule("a finite number, at least 0", lambda value: _is_number(value) and value >= 0)
 SHARE = Rule("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1)
+DISCOUNT = Rule("a number from 0 to 1, below 1", lambda value: _is_number(value) and 0 <= value < 1)
 PERIOD = Rule("a number above 0, or .inf", lambda value: value == math.inf or POSITIVE.allows(value))
 FLAG = Rule("true or false", lambda value: isinstance(value, bool))
 TEXT = Rule("a text", lambda value: isinstance(value, str) and bool(value))
-WIDTHS = Rule("a list of whole numbers, each at least 1", lambda value: _is_list(value, COUNT.allows))
+WIDTHS = Rule(
+    "a list of one or more whole numbers, each at least 1", lambda value: _is_list(value, COUNT.allows) and bool(value)
+)
 WEIGHTS = Rule("a list of finite numbers, each at least 0", lambda value: _is_list(value, NOT_NEGATIVE.allows))
 NAMES = Rule("a list of names", lambda value: _is_list(value, TEXT.allows))
 RANGE = Rule(
@@ -71,16 +74,17 @@ NAMES_BY_RULE: dict[Rule, str] = {
     SEED: "seed",
     POSITIVE: """
         lr critic_lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale
-        reach max_error width kept_width
+        reach speed max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",
     NOT_NEGATIVE: """
-        bound_coeff coeff kl_coeff termination_cost weight failure_weighting speed max_turn slope
+        bound_coeff coeff kl_coeff termination_cost weight failure_weighting max_turn slope
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
+    DISCOUNT: "gamma",
     SHARE: """
-        gamma lmbda discount epsilon momentum correlation terminations.initial initial_states.rest
+        lmbda discount epsilon momentum correlation terminations.initial initial_states.rest
         initial_states.motions beginnings_in_motion
     """,
     FLAG: """

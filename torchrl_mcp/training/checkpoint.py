@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
 
+import torch
 from torch import nn
 from torchrl import torchrl_logger
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 
 from torchrl_mcp.training.run_folder import CHECKPOINT, CHECKPOINTS, find_all, replacing
 
@@ -39,6 +40,32 @@ UNREADABLE = (
     ValueError,
     zlib.error,
 )
+
+
+class RunRandomness(GlobalRNGState):
+    """State of the random generators of a run: those of the CPU, and that of its own GPU.
+
+    TorchRL's class has those of all GPUs, and cannot be restored on a machine with fewer. On a CPU the state of a GPU
+    is left out.
+
+    Args:
+        device: Device of the run's networks.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states."""
+        state = super().state_dict()
+        state.pop("torch_cuda", None)
+        return state | ({"cuda": torch.cuda.get_rng_state(self.device)} if self.device.type == "cuda" else {})
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the states."""
+        super().load_state_dict({name: state for name, state in state_dict.items() if name != "torch_cuda"})
+        if self.device.type == "cuda" and "cuda" in state_dict:
+            torch.cuda.set_rng_state(state_dict["cuda"].cpu(), self.device)
 
 
 def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:

@@ -13,14 +13,14 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.objectives import KLAdaptiveLR
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.bar import TrainingBar
-from torchrl_mcp.training.checkpoint import load, run_checkpoint, save
+from torchrl_mcp.training.checkpoint import RunRandomness, load, run_checkpoint, save
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.episodes import EpisodeStatistics
@@ -128,7 +128,7 @@ class Trainer:
             episodes=self.episodes,
             frozen=frozen,
             progress=self.progress,
-            random=GlobalRNGState(),
+            random=RunRandomness(self.device),
         )
 
     def run(self) -> None:

@@ -52,6 +52,31 @@ def require_parts(parts: nn.ModuleDict, names: Iterable[str], argument: str) -> 
         raise ValueError(f"{argument} names {unknown}, but the parts of this method are {sorted(parts)}")
 
 
+def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Collection[str]) -> None:
+    """Check that frozen networks see the inputs of their pre-training, and that the critic is not frozen.
+
+    Args:
+        parts: All parts of an agent by name.
+        keep: Parts that come from pre-training.
+        freeze: Parts that do not change.
+
+    Raises:
+        ValueError: If the normaliser of their inputs may change, is not kept with them, or the critic is frozen.
+    """
+    if "critic" in freeze:
+        raise ValueError("transfer.freeze names the critic, which learns in every stage: leave it out")
+    normaliser = "observation_normaliser"
+    networks = [name for name in freeze if not name.endswith("_normaliser")]
+    if not networks or normaliser not in parts:
+        return
+    if normaliser not in freeze:
+        raise ValueError(
+            f"transfer.freeze names {networks}, whose outputs change with {normaliser}: add it to transfer.freeze"
+        )
+    if normaliser not in keep and not set(networks).isdisjoint(keep):
+        raise ValueError(f"transfer.keep names parts that need the {normaliser} of their pre-training: add it as well")
+
+
 def fingerprint(module: nn.Module) -> str:
     """Return a hash of all parameters and buffers of ``module``, sensitive to every bit."""
     digest = hashlib.sha256()
