@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import benchmark, policies
+from torchrl_mcp.runs import benchmark, experiment, policies
 
 BENCHMARKS = Path(conf.__file__).parent / "benchmark"
 CHARACTERS = {"ant", "biped", "humanoid", "trex"}
@@ -269,6 +269,17 @@ def test_a_folder_of_other_settings_is_not_taken_for_done(copy):
         smoke(copy, f"autocast={other}")
     assert all(str(run) in str(error.value) for run in folders(copy))
     assert times(copy) == before
+
+
+def test_a_benchmark_of_your_own_code_reads_its_runs_without_being_told_to_trust_them(tmp_path, monkeypatch, capsys):
+    lines = ["from torchrl_mcp.methods import scratch", "def parts(*args, **kwargs):"]
+    (tmp_path / "own_parts.py").write_text("\n".join([*lines, "    return scratch.gaussian_parts(*args, **kwargs)"]))
+    monkeypatch.syspath_prepend(tmp_path)
+    for _ in range(2):  # the second time, the run folder is there before
+        smoke(tmp_path / "runs", "method=scratch", "parts._target_=own_parts.parts")
+        assert "all 1 runs are complete" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="pass --trust own_parts"):
+        experiment.run_config(next(tmp_path.rglob("config.yaml")).parent)
 
 
 def needs_plugin(name):

@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
+from torchrl_mcp.runs.trust import targets, trusting
 from torchrl_mcp.training.run_folder import CONFIG, LOG
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
@@ -72,17 +73,28 @@ def main(arguments: Sequence[str]) -> None:
         master = hydra.compose_config("train", [*QUIET, *arguments], RunMode.MULTIRUN, with_log_configuration=False)
         context = HydraContext(config_loader=hydra.config_loader, callbacks=cast("Any", Callback()))
         jobs = plan(master, hydra.config_loader)
-        if conflicts := [line for job in jobs if (line := conflict(job))]:
-            raise ValueError("\n".join(["nothing was started, as there are runs with other settings:", *conflicts]))
         launcher = Plugins.instance().instantiate_launcher(context, run, master)
-        runs = {job.folder: job.config["training"]["total_frames"] for job in jobs}
-        name = MANIFEST.format(master.hydra.runtime.choices.benchmark)
-        write_manifest(runs, Path(master.hydra.sweep.dir) / name)
-        with overview(Path(master.run_root), runs):
-            launched = launch(jobs, launcher)
-    if unfinished := [line for job in jobs if (line := outcome(job, launched))]:
+        with trusting({name for job in jobs for name in targets(job.config)}):  # their run folders name them again
+            unfinished = complete(jobs, launcher, master)
+    if unfinished:
         sys.exit("\n".join(unfinished))
     print(f"all {len(jobs)} runs are complete: torchrl-mcp-report {master.run_root}")
+
+
+def complete(jobs: Sequence[Job], launcher: Launcher, master: DictConfig) -> list[str]:
+    """Launch the incomplete jobs of the benchmark ``master.benchmark``; return a line for each that stays incomplete.
+
+    Raises:
+        ValueError: If a folder holds a run of other settings.
+    """
+    if conflicts := [line for job in jobs if (line := conflict(job))]:
+        raise ValueError("\n".join(["nothing was started, as there are runs with other settings:", *conflicts]))
+    runs = {job.folder: job.config["training"]["total_frames"] for job in jobs}
+    name = MANIFEST.format(master.hydra.runtime.choices.benchmark)
+    write_manifest(runs, Path(master.hydra.sweep.dir) / name)
+    with overview(Path(master.run_root), runs):
+        launched = launch(jobs, launcher)
+    return [line for job in jobs if (line := outcome(job, launched))]
 
 
 def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
