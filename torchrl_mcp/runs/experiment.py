@@ -74,7 +74,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
 
 
 def settled(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with ``min_std`` and the widths of loaded networks: of those that transfer keeps, else all.
+    """Return the configuration with ``min_std`` and widths of loaded networks: those that transfer keeps, else all.
 
     Raises:
         ValueError: If there is no such pre-training.
