@@ -33,7 +33,7 @@ def sizes():
 def composite(sizes):
     """Small parts of a composite."""
 
-    def composite(*, gate_activation, distribution_class, num_primitives=4, gain=1.0, initial_std=0.3, min_std=0.0):
+    def composite(*, gate_activation, distribution_class, num_primitives=4, gain=1.0, initial_std=0.3):
         return composite_parts(
             *sizes,
             gating=partial(GATING, output_gain=gain),
@@ -42,7 +42,6 @@ def composite(sizes):
             num_primitives=num_primitives,
             distribution_class=distribution_class,
             initial_std=initial_std,
-            min_std=min_std,
         )
 
     return composite

@@ -26,28 +26,6 @@ def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives
         torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=tolerance)
 
 
-@pytest.mark.parametrize("num_primitives", [1, 4, 8])
-@pytest.mark.parametrize("mixer", MIXERS)
-def test_a_composite_of_the_narrowest_primitives_has_the_smallest_standard_deviation_allowed(
-    num_primitives, mixer, composite, states
-):
-    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MIXERS[mixer]}
-    parts = composite(**heads, num_primitives=num_primitives, gain=0.0, initial_std=0.17, min_std=0.06)
-    actor = composite_actor(parts, **heads).trained
-    stddev = actor.get_dist(states(50)).stddev
-    torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=1e-5)
-    with torch.no_grad():
-        parts["primitives"].output.bias[:, 3:] = -100.0
-    stddev = actor.get_dist(states(50)).stddev
-    torch.testing.assert_close(stddev, torch.full_like(stddev, 0.06), atol=0, rtol=1e-5)
-
-
-@pytest.mark.parametrize("min_std", [-0.1, 0.3, 0.4])
-def test_a_smallest_standard_deviation_that_the_initial_one_does_not_exceed_is_refused(min_std, composite):
-    with pytest.raises(ValueError, match=r"min_std must be at least 0 and below initial_std=0.3, got"):
-        composite(gate_activation=nn.Sigmoid(), distribution_class=MultiplicativeGaussian, min_std=min_std)
-
-
 @pytest.mark.parametrize("method", ["mcp", "moe"])
 def test_what_a_composite_plays_in_one_state_varies_by_the_standard_deviation_asked_for(method):
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):

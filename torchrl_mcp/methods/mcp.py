@@ -36,7 +36,6 @@ def composite_parts(
     num_primitives: int,
     distribution_class: Composition,
     initial_std: float,
-    min_std: float = 0.0,
     normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating`` and ``primitives``.
@@ -47,32 +46,28 @@ def composite_parts(
         action_dim: Size of the action, ``A``.
         gating: Makes the network for gate logits from ``(S, G, K)``.
         gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
-        primitives: Makes the primitives from ``(S, A, K, initial_std=, min_std=)``; they need a method ``rescale``
-            like :meth:`~torchrl_mcp.modules.Primitives.rescale`.
+        primitives: Makes the primitives from ``(S, A, K, initial_std=)``; they need a method ``rescale`` like
+            :meth:`~torchrl_mcp.modules.Primitives.rescale`.
         num_primitives: Number of primitives, ``K``.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
         initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixer. It
             includes the variance of each primitive and the variance between their means, and is a root mean square over
             normalised states and actions.
-        min_std: Lower bound on the standard deviation of the composite at the gate's initial weights, in action units.
-            It bounds each primitive in proportion, so that other weights of the gate change it.
         normaliser: Makes an input normaliser from a size.
 
     Raises:
-        ValueError: If ``num_primitives`` is not positive, or ``min_std`` negative or not below ``initial_std``.
+        ValueError: If ``num_primitives`` is not positive.
     """
     if num_primitives < 1:
         raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
-    if not 0 <= min_std < initial_std:
-        raise ValueError(f"min_std must be at least 0 and below initial_std={initial_std}, got {min_std}")
     # A composite's standard deviation is proportional to its primitives'. First compose K unit Gaussians at the gate's
     # initial weights and divide. Then do the same with the networks, whose primitives have different means.
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
-    share = 1 / distribution_class(torch.zeros_like(unit), unit, gates).stddev.item()
+    composite = distribution_class(torch.zeros_like(unit), unit, gates)
     gate = gating(observation_dim, goal_dim, num_primitives)
     networks = primitives(
-        observation_dim, action_dim, num_primitives, initial_std=initial_std * share, min_std=min_std * share
+        observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
     )
     with torch.no_grad():
         states, goals = _normalised_inputs(observation_dim, goal_dim)

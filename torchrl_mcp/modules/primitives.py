@@ -24,13 +24,10 @@ class Primitives(nn.Module):
         branch_cells: Hidden units of each primitive's own layer; 0 for none.
         width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
-        min_std: Lower bound :math:`m` on the standard deviations: they are :math:`\sqrt{e^{2 x} + m^2}` of an output
-            :math:`x`.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
 
     Raises:
-        ValueError: If ``num_primitives`` or ``initial_std`` is not positive, or ``min_std`` negative or not below
-            ``initial_std``.
+        ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Figure 3, Eq. 4 and Section E.6. https://arxiv.org/abs/1905.09808
@@ -46,7 +43,6 @@ class Primitives(nn.Module):
         branch_cells: int = 256,
         width: float = 1.0,
         initial_std: float = 1.0,
-        min_std: float = 0.0,
         output_gain: float = 1.0,
     ) -> None:
         super().__init__()
@@ -54,9 +50,6 @@ class Primitives(nn.Module):
             raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
         if not initial_std > 0:
             raise ValueError(f"initial_std must be positive, got {initial_std}")
-        if not 0 <= min_std < initial_std:
-            raise ValueError(f"min_std must be at least 0 and below initial_std={initial_std}, got {min_std}")
-        self.min_std = min_std
         trunk_cells = scaled_cells(trunk_cells, width)
         branch_cells = scaled_cells([branch_cells], width)[0] if branch_cells else 0
         self.trunk = relu_mlp(observation_dim, trunk_cells)
@@ -66,7 +59,7 @@ class Primitives(nn.Module):
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
             self.output.bias.zero_()
-            self.output.bias[:, action_dim:] = math.log(initial_std**2 - min_std**2) / 2
+            self.output.bias[:, action_dim:] = math.log(initial_std)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
@@ -74,24 +67,15 @@ class Primitives(nn.Module):
         if self.branches is not None:
             features = self.rectifier(self.branches(features))
         loc, log_scale = self.output(features).chunk(2, dim=-1)
-        scale = log_scale.float().exp()
-        return loc, (scale.square() + self.min_std**2).sqrt() if self.min_std else scale
+        return loc, log_scale.float().exp()
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
-        """Multiply all means by ``factor``, positive, and the standard deviations where their outputs are the biases.
-
-        Raises:
-            ValueError: If a standard deviation would not exceed ``min_std``.
-        """
+        """Multiply all means and standard deviations by ``factor``, positive."""
         action_dim = self.output.bias.shape[-1] // 2
-        log_scale = self.output.bias[:, action_dim:]
-        variance = factor**2 * (log_scale.mul(2).exp() + self.min_std**2) - self.min_std**2
-        if not (variance > 0).all():
-            raise ValueError(f"min_std={self.min_std} is not below the standard deviations that rescale makes")
         self.output.weight[..., :action_dim] *= factor
         self.output.bias[:, :action_dim] *= factor
-        log_scale.copy_(variance.log() / 2)
+        self.output.bias[:, action_dim:] += math.log(factor)
 
 
 class BatchedLinear(nn.Module):

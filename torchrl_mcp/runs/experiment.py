@@ -74,7 +74,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
 
 
 def settled(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with ``min_std`` and widths of loaded networks: those that transfer keeps, else all.
+    """Return the configuration with the widths of loaded networks: of those that transfer keeps, else of all.
 
     Raises:
         ValueError: If there is no such pre-training.
@@ -87,7 +87,7 @@ def settled(cfg: DictConfig) -> DictConfig:
     widths = {"width": width, "kept_width": saved.get("kept_width", width)}
     if cfg.stage.name == "transfer":
         del widths["width"]
-    return cast("DictConfig", OmegaConf.merge(cfg, widths, {"min_std": saved.get("min_std", 0.0)}))
+    return cast("DictConfig", OmegaConf.merge(cfg, widths))
 
 
 def run_config(folder: Path) -> DictConfig:

@@ -79,7 +79,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",
     NOT_NEGATIVE: """
-        min_std bound_coeff coeff kl_coeff termination_cost weight failure_weighting max_turn slope
+        bound_coeff coeff kl_coeff termination_cost weight failure_weighting max_turn slope
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     DISCOUNT: "gamma",
