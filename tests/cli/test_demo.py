@@ -2,31 +2,28 @@
 
 import csv
 import json
-import math
+import re
+import shlex
 import subprocess
 import sys
 import time
 from contextlib import redirect_stdout
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from torchrl_mcp.cli import demo as command
 from torchrl_mcp.cli import demonstration as demo
 from torchrl_mcp.runs import policies
+from torchrl_mcp.runs.builtin import builtin
 
-FILES = [
-    "results.md",
-    "results.json",
-    "learning_curves.png",
-    "learning_curves.svg",
-    "learning_curves.csv",
-    "trajectories.png",
-    "trajectories.svg",
-]
-SMOKE = ["preset=demo_smoke"]
+FILES = ["index.html", "results.md", "results.json", *(f"learning_curves.{suffix}" for suffix in ("png", "svg", "csv"))]
+SMOKE = {"preset": "demo_smoke"}
 
 
 @pytest.fixture(scope="module")
@@ -36,36 +33,22 @@ def finished(tmp_path_factory):
     command = [sys.executable, "-m", "torchrl_mcp.cli.demo", "--smoke", "--output", folder]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
-    while not (folder / "transfer" / "config.yaml").exists():
+    while not list(folder.glob("mcp/checkpoints/checkpoint-*256.torchrl")):
         assert killed.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
     killed.kill()
     killed.wait()
-    half = contents(folder)
+    half = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     with redirect_stdout(StringIO()) as output:
-        demo.run(folder, SMOKE)
+        demo.run(folder, [], **SMOKE)
     return SimpleNamespace(folder=folder, half=half, output=output.getvalue())
 
 
-def contents(folder):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
-
-
-def configurations(folder, *overrides):
-    return {name: demo.configure(folder / name, [*own, *overrides]) for name, own in demo.RUNS.items()}
-
-
-def test_it_was_killed_after_pretraining_and_before_the_end(finished):
-    names = {path.relative_to(finished.folder).as_posix() for path in finished.half}
-    assert "pretrain/checkpoints/checkpoint-000000000512.torchrl" in names
-    assert not names & set(FILES)
-
-
-def test_called_again_it_keeps_what_was_done_and_does_the_rest_once(finished):
-    checkpoint = finished.folder / "pretrain" / "checkpoints" / "checkpoint-000000000512.torchrl"
-    assert checkpoint.stat().st_mtime_ns == finished.half[checkpoint]
-    for name in demo.RUNS:
+def test_called_again_it_goes_on_where_it_was_killed(finished):
+    assert "mcp/checkpoints/checkpoint-000000000256.torchrl" in finished.half
+    assert not finished.half & {*FILES, "mcp/evaluation.json"}
+    for name in ("mcp", "scratch"):
         with (finished.folder / name / "metrics.csv").open(newline="") as file:
             assert [int(row["iteration"]) for row in csv.DictReader(file)] == [1, 2, 3, 4]
 
@@ -73,62 +56,82 @@ def test_called_again_it_keeps_what_was_done_and_does_the_rest_once(finished):
 def test_everything_promised_is_in_one_folder(finished):
     for name in FILES:
         assert (finished.folder / name).stat().st_size > 0
-    for name in demo.RUNS:
-        assert (finished.folder / name / "config.yaml").is_file()
+        assert name.partition(".")[0] in finished.output
+    assert imread(finished.folder / "learning_curves.png").std() > 0.03
 
 
-@pytest.mark.parametrize("name", ["learning_curves.png", "trajectories.png"])
-def test_pictures_decode_and_are_not_blank(finished, name):
-    picture = imread(finished.folder / name)
-    assert min(picture.shape[:2]) > 600
-    assert picture.std() > 0.03
+def test_the_page_shows_only_what_is_there(finished):
+    page = (finished.folder / "index.html").read_text()
+    pictures = re.findall(r'<img src="([^"]+)"', page)
+    assert pictures[-1] == "learning_curves.svg"
+    assert all((finished.folder / picture).is_file() for picture in pictures)
+    assert re.findall(r"<tr><td>(\w+)</td>", page) == ["MCP", "scratch"]
 
 
-def test_the_last_words_are_the_table_and_where_to_find_it(finished):
-    assert (finished.folder / "results.md").read_text().strip() in finished.output
-    assert str(finished.folder) in finished.output
-    assert "film" in finished.output.splitlines()[-1]
-    for name in FILES:
-        stem, suffix = name.split(".")
-        assert stem in finished.output
-        assert f".{suffix}" in finished.output
+@pytest.mark.parametrize("name", ["mcp", "scratch"])
+def test_the_table_holds_the_numbers_of_an_evaluation(finished, name):
+    again = policies.evaluation(finished.folder / name, episodes=4, seed=12345)
+    expected = {mode: again[mode] for mode in ("deterministic", "stochastic")}
+    (row,) = (
+        row
+        for row in json.loads((finished.folder / "results.json").read_text())["rows"]
+        if row["policy"] == demo.TITLES[name]
+    )
+    assert {mode: row[mode] for mode in expected} == expected
+    assert f"{expected['deterministic']['normalised_return']:.3f} [" in finished.output
 
 
-@pytest.mark.parametrize("name", ["before", "after", "scratch_early", "scratch"])
-def test_the_table_holds_the_numbers_of_an_evaluation_on_the_held_out_directions(finished, name):
-    policy = demo.policies(finished.folder, configurations(finished.folder, *SMOKE))[name]
-    expected = policies.evaluate_run(policy.path, episodes=8, seed=12345, directions=[1.5 * math.pi, 2 * math.pi])
-    found = json.loads((finished.folder / "results.json").read_text())[name]
-    assert {mode: found[mode] for mode in expected} == expected
-    rows = [line for line in (finished.folder / "results.md").read_text().splitlines() if policy.label in line]
-    for numbers in expected.values():
-        assert any(f"{numbers['normalised_return']:.3f} [" in row for row in rows)
+def test_both_are_filmed_side_by_side_under_the_same_arrow(finished):
+    path = finished.folder / demo.FILM
+    if not path.exists():
+        assert "no film" in finished.output
+        pytest.skip("no OpenGL")
+    with Image.open(path) as film:
+        first = np.asarray(film.convert("RGB"), dtype=int)
+    assert first.shape == (240, 640, 3)
+    red = [np.argwhere((half[..., 0] > 150) & (half[..., 1] < 90)) for half in (first[:, :320], first[:, 320:])]
+    assert all(len(pixels) > 20 for pixels in red)
+    assert np.abs(red[0].mean(0) - red[1].mean(0)).max() < 12
+
+
+def test_its_next_commands_are_commands_of_this_library(finished):
+    for words in map(shlex.split, demo.commands(finished.folder).values()):
+        assert shlex.join(words) in finished.output
+        assert words[0] in (Path(sys.executable).parent / words[0]).name
+        assert (Path(sys.executable).parent / words[0]).exists()
 
 
 def test_an_existing_folder_with_other_settings_is_refused(finished):
     with pytest.raises(ValueError, match="holds a run with other settings: give another --output"):
-        demo.configure(finished.folder / "pretrain", [*demo.RUNS["pretrain"], *SMOKE, "seed=1"])
+        demo.configure(finished.folder, ["seed=1"], pretrain=False, **SMOKE)
 
 
-def test_the_full_budget_keeps_a_checkpoint_of_scratch_after_as_many_steps_as_transfer(tmp_path):
-    runs = configurations(tmp_path, "preset=demo")
-    demo.require_early_checkpoint(runs)
-    policies, cfg = demo.policies(tmp_path, runs), runs["scratch"]
-    later = policies["scratch"].steps - policies["scratch_early"].steps
-    assert later / (cfg.checkpoint_interval * cfg.training.frames_per_batch) < cfg.keep_checkpoints
+@pytest.mark.parametrize("pretrain", [False, True])
+def test_the_full_budgets_are_the_ones_that_it_tells(tmp_path, pretrain):
+    runs = demo.configure(tmp_path, [], preset="demo", pretrain=pretrain)
+    steps = {name: cfg.training.total_frames for name, cfg in runs.items()}
+    assert steps["scratch"] == steps["mcp"] + steps.get("pretrain", 0)
+    assert runs["mcp"].pretrained == (str(tmp_path / "pretrain") if pretrain else "builtin")
+    told = [int(number.replace(",", "")) for number in re.findall(r"[\d,]{5,}\d", demo.introduction(runs, tmp_path))]
+    assert {told[0], told[-1]} == {steps.get("pretrain", steps["mcp"]), steps["mcp"]}
 
 
-def test_a_budget_that_leaves_scratch_without_that_checkpoint_is_refused_before_training(tmp_path):
-    runs = configurations(tmp_path, *SMOKE, "training.total_frames=1024", "checkpoint_interval=3")
-    runs["transfer"].training.total_frames = 512
-    with pytest.raises(ValueError, match=r"ends after 512 steps, .* only one every 384"):
-        demo.require_early_checkpoint(runs)
+def test_the_primitives_had_as_many_steps_of_imitation_as_it_says():
+    card = builtin("mcp", "humanoid").with_suffix(".md").read_text()
+    assert re.search(r"\| training \| ([\d,]+) steps", card)[1] == f"{demo.BUILTIN_STEPS:,}"
 
 
-def test_the_full_budget_gives_scratch_as_many_steps_as_pretraining_and_transfer_together(tmp_path):
-    policies = demo.policies(tmp_path, configurations(tmp_path, "preset=demo"))
-    assert policies["scratch"].steps == policies["after"].steps + policies["after"].pretraining_steps
-    assert policies["scratch_early"].steps == policies["after"].steps
+def test_the_return_is_shown_once_full_episodes_can_have_ended(tmp_path):
+    cfg = demo.configure(tmp_path, [], preset="demo", pretrain=False)["mcp"]
+    rows = "".join(f"{i},{1024 * i},{0.5 if i < 18 else 0.75}\n" for i in range(1, 30))
+    Path(cfg.run_dir).mkdir()
+    lines = rows.splitlines(keepends=True)
+    metrics = Path(cfg.run_dir, "metrics.csv")
+    shown = {}
+    for count in (18, 29):  # 32 environments with episodes of 600 steps: 19,200
+        metrics.write_text("iteration,frames,episode/normalised_return\n" + "".join(lines[:count]))
+        shown[count] = demo.progress(cfg)
+    assert shown == {18: (18 * 1024, None), 29: (29 * 1024, 0.75)}
 
 
 @pytest.mark.parametrize("override", ["nonsense=1", "seed", "preset=unknown"])
@@ -139,25 +142,12 @@ def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, ove
     assert not (tmp_path / "demo").exists()
 
 
-def test_it_says_in_the_beginning_how_long_it_takes(finished):
-    first, *_ = finished.output.splitlines()
-    assert first == f"This takes about 1 minutes on two cores. Everything lands in {finished.folder}."
-
-
-def test_the_ant_is_filmed_once(finished, monkeypatch):
-    pictures = []
-    monkeypatch.setattr(demo, "save_film", lambda policy, env, path, seconds: pictures.append(path.touch()))
-    (finished.folder / demo.FILM).unlink(missing_ok=True)
-    lines = [demo.film(finished.folder, 1.0) for _ in range(2)]
-    assert len(pictures) == 1
-    assert lines[0] == lines[1]
-    assert "film.gif" in lines[0]
-
-
-def test_where_nothing_can_be_drawn_the_demonstration_says_so_and_ends_well(finished, monkeypatch):
+def test_where_nothing_can_be_drawn_the_demonstration_says_so_and_ends_well(finished, monkeypatch, capsys):
     def refuse(*arguments, **settings):
         raise RuntimeError("no OpenGL")
 
-    monkeypatch.setattr(demo, "save_film", refuse)
+    monkeypatch.setattr(demo, "save_films", refuse)
     (finished.folder / demo.FILM).unlink(missing_ok=True)
-    assert demo.film(finished.folder, 1.0) == "  no film: no OpenGL"
+    runs = demo.configure(finished.folder, [], pretrain=False, **SMOKE)
+    assert not demo.film(finished.folder, runs)
+    assert capsys.readouterr().out == "no film: no OpenGL\n"

@@ -194,3 +194,20 @@ def test_the_range_of_two_seeds_is_called_so_and_the_mixers_equations_are_the_pa
     for page in report(*find_runs(folders), moment=MOMENT).values():
         assert "range 0.500 to 0.600" in page
         assert "Multiplicative composition of primitives (Eq. 3), or additive (Eq. 1)" in page
+
+
+def test_networks_of_which_a_third_of_a_layer_is_dead_after_training_are_named(write_run, parse_page):
+    for name, progress, shares in (("dying", 1.0, (0.4, 0.2)), ("young", 0.5, (0.4, 0.4)), ("alive", 1.0, (0.1, 0.1))):
+        folder = write_run(name, seed=len(name), progress=progress, score=0.5)
+        header, *lines = (folder / "metrics.csv").read_text().split()
+        lines = [f"{line},0.9,0.9" for line in lines[:-1]] + ["{},{},{}".format(lines[-1], *shares)]
+        metrics = [f"{header},dead_units/critic,dead_units/gating", *lines]
+        (folder / "metrics.csv").write_text("\n".join(metrics) + "\n")
+    pages = report(*find_runs([folder.parent]), moment=MOMENT)
+    remarks = [
+        text for row in rows(next(section(parse_page(pages["report.html"]), "runs").all("table"))) for text in row
+    ]
+    assert [text for text in remarks if "dead" in text] == ["complete critic: 40% dead"]
+    assert [line for line in pages["report.md"].splitlines() if "critic 40%" in line] == [
+        f"- {folder.parent}/dying: critic 40%"
+    ]

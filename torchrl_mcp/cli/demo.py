@@ -1,4 +1,4 @@
-"""``torchrl-mcp-demo``: pre-train primitives, transfer them to unseen directions, and compare with scratch."""
+"""``torchrl-mcp-demo``: a new gate over MCP's primitives beside scratch, after the same steps."""
 
 import argparse
 import sys
@@ -18,8 +18,9 @@ def main() -> None:
     from torchrl_mcp.cli.demonstration import run
 
     preset = "demo_smoke" if arguments.smoke else "demo"
+    output = arguments.output or Path("runs", "demo-pretrain" if arguments.pretrain else "demo")
     try:
-        run(arguments.output, [f"preset={preset}", *arguments.overrides])
+        run(output, arguments.overrides, preset=preset, pretrain=arguments.pretrain)
     except (HydraException, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
@@ -28,14 +29,17 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = new_parser(PROGRAM, "Pre-train primitives, transfer them to directions never seen, compare with scratch.")
+    parser = new_parser(
+        PROGRAM, "A new gate over MCP's primitives steers a humanoid, beside scratch after the same steps."
+    )
     parser.add_argument(
         "overrides",
         nargs="*",
         metavar="SETTING=VALUE",
         help="settings of all runs, as for torchrl-mcp-train: seed=1",
     )
-    parser.add_argument("--output", type=Path, default=Path("runs/demo"), help="folder (default runs/demo)")
+    parser.add_argument("--output", type=Path, help="folder (default runs/demo, or runs/demo-pretrain)")
+    parser.add_argument("--pretrain", action="store_true", help="train the primitives too, which takes longer")
     parser.add_argument("--smoke", action="store_true", help="only test that the demonstration runs, in seconds")
     return parser
 

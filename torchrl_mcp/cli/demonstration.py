@@ -1,261 +1,267 @@
-"""The demonstration: pre-train primitives, transfer them to unseen directions, and compare with scratch.
+"""The demonstration: a new gate over MCP's primitives and scratch learn the same task for the same steps, side by side.
 
-Two processes run in parallel, one for MCP and one for scratch, which gets as many steps as MCP's pre-training and
-transfer together. All results are written to one folder, and results that are already there are reused.
+Two processes train at once, one core each. All results are written to one folder, and what is already there is reused.
 """
 
 import json
 import math
+import shlex
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp import __version__, analysis
-from torchrl_mcp.evaluation.bars import bar
+from torchrl_mcp.cli.demonstration_page import write_page
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.identity import PLACES, differences
-from torchrl_mcp.runs.policies import evaluate_run, restore
+from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.bar import TrainingBar
-from torchrl_mcp.training.checkpoint import FOLDER
-from torchrl_mcp.training.run_folder import CONFIG, replacing, write_json
-from torchrl_mcp.viewer.film import save_film
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics, replacing, write_json
+from torchrl_mcp.viewer.film import save_films
+from torchrl_mcp.viewer.player import Player
 
 Runs = Mapping[str, DictConfig]
 
+HEADING = ["task=heading", "character=humanoid"]
 RUNS = {
-    "pretrain": ["method=mcp", "stage=pretrain"],
-    "transfer": ["method=mcp", "stage=transfer"],
-    "scratch": ["method=scratch", "stage=transfer"],
+    "pretrain": ["method=mcp", "task=imitation", "character=humanoid", "stage=pretrain"],
+    "mcp": ["method=mcp", *HEADING, "stage=transfer", "exploration=weights"],
+    "scratch": ["method=scratch", *HEADING],
 }
+TITLES = {"pretrain": "primitives", "mcp": "MCP", "scratch": "scratch"}
+BUILTIN_STEPS = 10_649_600
+"""Environment steps of imitation of the humanoid's primitives that come with the library."""
 
-# Panels of the picture: title, run, and stage whose directions are the ant's targets.
-PANELS = {
-    "seen": ("pre-training directions,\nas pre-trained", "pretrain", "pretrain"),
-    "before": ("held-out directions,\nas pre-trained", "pretrain", "transfer"),
-    "after": ("held-out directions,\nafter transfer", "transfer", "transfer"),
-}
-SPACING = math.radians(15)
+RECENT = 10
+"""Iterations whose returns are averaged in the line of progress."""
 
 FILM = "film.gif"
-CONTENTS = """\
-  results.md, results.json           the table, and all its numbers
-  learning_curves.png, .svg, .csv    learning on the held-out directions
-  trajectories.png, .svg             where the ant went, by target direction
-  pretrain/, transfer/, scratch/     run folders: torchrl-mcp-evaluate {folder}/transfer"""
+CONTENTS = {
+    "index.html": "all of it on one page",
+    "results.md, results.json": "the table, and its numbers",
+    "learning_curves.png, .svg, .csv": "both curves",
+    FILM: "both side by side, under the same arrow",
+    "mcp/, scratch/": "run folders, for every other command",
+}
 
 
-@dataclass(frozen=True)
-class Policy:
-    """A policy in the table of results.
-
-    Attributes:
-        label: Name in the table.
-        path: Run folder or checkpoint file.
-        steps: Environment steps of training on the held-out directions.
-        pretraining_steps: Environment steps of pre-training on the other directions.
-    """
-
-    label: str
-    path: Path
-    steps: int
-    pretraining_steps: int = 0
-
-
-def run(folder: Path, overrides: Sequence[str]) -> None:
+def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrain: bool = False) -> None:
     """Train, evaluate and report in ``folder``, except for results that it already has.
+
+    Args:
+        folder: The folder of the demonstration.
+        overrides: Settings of all runs, as for ``torchrl-mcp-train``.
+        preset: Preset of the runs; that of pre-training is ``<preset>_pretrain``.
+        pretrain: Train the primitives too. Scratch then has as many steps as both stages together.
 
     Raises:
         ValueError: If the settings contradict each other or the folder's, or a process fails.
     """
     began = time.monotonic()
-    runs = {name: configure(folder / name, [*RUNS[name], *overrides]) for name in RUNS}
-    runs["transfer"].pretrained = runs["pretrain"].run_dir
-    require_early_checkpoint(runs)
-    settings = runs["pretrain"].demo
-    print(f"This takes about {settings.minutes} minutes on two cores. Everything lands in {folder}.")
-    print("You may interrupt it: repeat the command to continue.", flush=True)
-    show_progress([start(learn_and_transfer, folder, runs), start(learn_from_scratch, folder, runs)], folder, runs)
-    print("\n" + report(folder, runs))
-    filmed = film(folder, settings.film.seconds)
-    print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes everything is in {folder}:")
-    print(f"{CONTENTS.format(folder=folder)}\n{filmed}")
+    runs = configure(folder, overrides, preset=preset, pretrain=pretrain)
+    print(introduction(runs, folder), flush=True)
+    cores = [[cfg for name, cfg in runs.items() if name != "scratch"], [runs["scratch"]]]
+    show_progress([start(learn, core) for core in cores], runs)
+    rows = results(runs)
+    print("\n" + report(folder, runs, rows))
+    filmed = film(folder, runs)
+    write_page(
+        folder,
+        table_rows(rows),
+        caption=caption(runs, rows),
+        film=FILM if filmed else None,
+        curves="learning_curves.svg",
+        commands=commands(folder),
+    )
+    print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes, in {folder}:")
+    for name, content in CONTENTS.items():
+        if filmed or name != FILM:
+            print(f"  {name:35}{content}")
+    print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder).items()), sep="\n")
 
 
-def film(folder: Path, seconds: float) -> str:
-    """Film the ant after transfer, unless there is a film, and return its line in the list of contents."""
-    path = folder / FILM
-    _, agent, env = restore(folder / "transfer", num_envs=1, seed=0)
-    try:
-        if not path.exists():
-            save_film(agent.actor.policy, env, path, seconds=seconds)
-    except RuntimeError as error:
-        return f"  no film: {error}"
-    return f"  {FILM:35}the ant runs in held-out directions"
-
-
-def configure(folder: Path, overrides: Sequence[str]) -> DictConfig:
-    """Return the configuration of the run in ``folder``.
+def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: bool) -> dict[str, DictConfig]:
+    """Return the configurations of the runs in ``folder``.
 
     Raises:
         ValueError: If the folder holds a run with another configuration.
     """
-    cfg = build.compose_run(*overrides)
-    cfg.run_dir = str(folder)
+    presets = dict.fromkeys(RUNS, f"preset={preset}") | {"pretrain": f"preset={preset}_pretrain"}
+    runs = {
+        name: build.compose_run(*words, presets[name], *overrides)
+        for name, words in RUNS.items()
+        if pretrain or name != "pretrain"
+    }
+    runs["mcp"].pretrained = str(folder / "pretrain") if pretrain else "builtin"
+    if pretrain:
+        runs["scratch"].training.total_frames += runs["pretrain"].training.total_frames
+    for name, cfg in runs.items():
+        cfg.run_dir = str(folder / name)
+        _require_same(cfg, folder / name)
+    return runs
+
+
+def _require_same(cfg: DictConfig, folder: Path) -> None:
+    """Check that a run in ``folder``, if there is one, has the configuration, and take over its precision.
+
+    Raises:
+        ValueError: If the folder holds a run with another configuration.
+    """
     if not (folder / CONFIG).exists():
-        return cfg
+        return
     held = experiment.run_config(folder)
-    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, cfg))
+    cfg.autocast = held.autocast
+    wanted = experiment.settled(cfg) if cfg.pretrained == "builtin" else cfg
+    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, wanted))
     if differences(began, begins, PLACES):
         raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
-    cfg.autocast = held.autocast  # the precision that the run chose
-    return cfg
 
 
-def require_early_checkpoint(runs: Runs) -> None:
-    """Check that scratch writes a checkpoint after as many steps as transfer takes."""
-    steps, scratch = _steps(runs["transfer"]), runs["scratch"]
-    between = scratch.checkpoint_interval * scratch.training.frames_per_batch
-    if steps % between and steps != _steps(scratch):
-        raise ValueError(
-            f"transfer ends after {steps} steps, and scratch has no checkpoint there to compare with, only one every "
-            f"{between}: make budget.transfer a multiple of that, or checkpoint_interval smaller"
+def introduction(runs: Runs, folder: Path) -> str:
+    """Return what is going on, and how long it will take."""
+    minutes = runs.get("pretrain", runs["mcp"]).demo.minutes
+    if "pretrain" in runs:
+        first = (
+            f"Primitives first imitate walks for {_steps(runs['pretrain']):,} steps; then a gate over them learns to "
+            f"steer the humanoid in {_steps(runs['mcp']):,}. Scratch has as many steps as both."
         )
-
-
-def policies(folder: Path, runs: Runs) -> dict[str, Policy]:
-    """Return the lines of the table."""
-    pretraining, transfer, scratch = (_steps(runs[name]) for name in RUNS)
-    early = folder / "scratch" / FOLDER / f"checkpoint-{transfer:012d}.torchrl"
-    return {
-        "before": Policy("MCP before transfer", folder / "pretrain", 0, pretraining),
-        "after": Policy("MCP after transfer", folder / "transfer", transfer, pretraining),
-        "scratch_early": Policy("scratch", early, transfer),
-        "scratch": Policy("scratch", folder / "scratch", scratch),
-    }
-
-
-def learn_and_transfer(folder: Path, runs: Runs) -> None:
-    """Pre-train MCP, transfer it, evaluate it before and after, and record its trajectories."""
-    experiment.train_or_resume(runs["pretrain"])
-    experiment.train_or_resume(runs["transfer"])
-    for name in ("before", "after"):
-        evaluate(folder, runs, name)
-    for name in PANELS:
-        record_trajectories(folder, runs, name)
-
-
-def learn_from_scratch(folder: Path, runs: Runs) -> None:
-    """Train scratch on the held-out directions, and evaluate it."""
-    experiment.train_or_resume(runs["scratch"])
-    for name in ("scratch_early", "scratch"):
-        evaluate(folder, runs, name)
-
-
-def evaluate(folder: Path, runs: Runs, name: str) -> None:
-    """Evaluate one of the :func:`policies` on the held-out directions."""
-    file, cfg = evaluation_file(folder, name), runs["transfer"]
-    if file.exists():
-        return
-    path, directions = policies(folder, runs)[name].path, cfg.task.directions.transfer
-    results = evaluate_run(path, episodes=cfg.demo.episodes, seed=cfg.demo.seed, directions=directions)
-    write_json(results, file)
-
-
-def record_trajectories(folder: Path, runs: Runs, name: str) -> None:
-    """Record the trajectories of one of the ``PANELS``."""
-    file, (_, run_name, stage) = trajectory_file(folder, name), PANELS[name]
-    if file.exists():
-        return
-    cfg = runs[run_name]
-    low, high = cfg.task.directions[stage]
-    grid = torch.linspace(low, high, round((high - low) / SPACING) + 1)
-    directions = grid.repeat_interleave(cfg.demo.paths.per_direction)
-    _, agent, env = restore(
-        Path(cfg.run_dir), num_envs=len(directions), seed=cfg.demo.seed, max_episode_steps=cfg.demo.paths.steps
+    else:
+        first = (
+            f"A gate over MCP's eight primitives, and scratch, each learn in {_steps(runs['mcp']):,} steps to walk "
+            f"the humanoid\nwhere an arrow points. {remark(runs)}"
+        )
+    return (
+        f"{first}\nThis takes about {minutes} minutes on two cores. You may interrupt it: repeat the command to "
+        f"continue. Everything lands in {folder}."
     )
-    with replacing(file) as partial:
-        analysis.save_trajectories(analysis.play_directions(agent.actor.policy, env, directions), partial)
 
 
-def show_progress(processes: Sequence[BaseProcess], folder: Path, runs: Runs) -> None:
-    """Show the progress of training, then of evaluation, until both are done."""
-    files = [evaluation_file(folder, name) for name in policies(folder, runs)]
-    files += [trajectory_file(folder, name) for name in PANELS]
-    total, done = sum(map(_steps, runs.values())), _steps_taken(folder, runs)
+def remark(runs: Runs) -> str:
+    """Return what the comparison is, and what it is not."""
+    if "pretrain" in runs:
+        return "Scratch had as many steps as pre-training and transfer together."
+    return (
+        f"MCP's primitives had {BUILTIN_STEPS / 1e6:.1f} million steps of imitation before, scratch none:\nwith four "
+        "million steps of its own, scratch reaches 0.918."
+    )
+
+
+def learn(runs: Sequence[DictConfig]) -> None:
+    """Train and evaluate runs, one after the other."""
+    for cfg in runs:
+        experiment.train_or_resume(cfg)
+
+
+def show_progress(processes: Sequence[BaseProcess], runs: Runs) -> None:
+    """Show one line of progress of all runs until they are trained, then until they are evaluated."""
+    total, done = sum(map(_steps, runs.values())), sum(progress(cfg)[0] for cfg in runs.values())
     moments = ticks(processes, interval=1.0)
-    with TrainingBar(total, done) as shown:
+    with TrainingBar(total, done) as line:
         for _ in moments:
-            before, done = done, _steps_taken(folder, runs)
-            shown.advance(done - before, math.nan)
-            if done == total:
+            now = {TITLES[name]: progress(cfg) for name, cfg in runs.items()}
+            before, done = done, sum(steps for steps, _ in now.values())
+            line.advance(done - before, ", ".join(f"{name} {value:.2f}" for name, (_, value) in now.items() if value))
+            if done >= total:
                 break
-    with bar(len(files), "evaluation") as evaluated:
-        for _ in moments:
-            evaluated.update(sum(file.exists() for file in files) - evaluated.n)
+    print(f"Both play {runs['mcp'].evaluation.episodes} episodes, without and with exploration.", flush=True)
+    for _ in moments:
+        pass
 
 
-def report(folder: Path, runs: Runs) -> str:
-    """Write table and figures, and return the table."""
-    cfg, lines = runs["transfer"], policies(folder, runs)
-    results = {name: json.loads(evaluation_file(folder, name).read_text()) for name in lines}
-    low, high = (math.degrees(angle) for angle in cfg.task.directions.transfer)
-    table = _table(lines, results) + (
-        f"\n\nNormalised return on directions from {low:.0f} to {high:.0f} degrees: mean of {cfg.demo.episodes} "
-        "episodes and its 95 % interval. Steps are those of training on these directions, steps before those of "
-        f"pre-training on the others. Seed {cfg.seed}, torchrl-mcp {__version__}."
-    )
-    details = {
-        name: {"label": line.label, "steps": line.steps, "pretraining_steps": line.pretraining_steps, **results[name]}
-        for name, line in lines.items()
-    }
+def progress(cfg: DictConfig) -> tuple[int, float | None]:
+    """Return the steps of a run, and its recent mean return once episodes of full length can have ended."""
+    rows = read_metrics(Path(cfg.run_dir))
+    if not rows:
+        return 0, None
+    task, training = cfg.task[cfg.stage.name], cfg.training
+    full = training.num_envs * task.get("max_episode_steps", cfg.task.evaluation.max_episode_steps)
+    recent = [row[NORMALISED_RETURN] for row in rows[-RECENT:] if row["frames"] > full]
+    ended = [value for value in recent if math.isfinite(value)]
+    return int(rows[-1]["frames"]), sum(ended) / len(ended) if ended else None
+
+
+def results(runs: Runs) -> list[dict[str, Any]]:
+    """Return the rows of the table."""
+    rows = []
+    for name in ("mcp", "scratch"):
+        numbers = json.loads(Path(runs[name].run_dir, EVALUATION).read_text())
+        before = 0 if name == "scratch" else _steps(runs["pretrain"]) if "pretrain" in runs else BUILTIN_STEPS
+        rows.append({"policy": TITLES[name], "steps": _steps(runs[name]), "steps before": before, **numbers})
+    return rows
+
+
+def report(folder: Path, runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write table, numbers and learning curves, and return the table with its caption."""
+    table = f"{text_table(table_rows(rows), markdown=True)}\n\n{caption(runs, rows)}"
     with replacing(folder / "results.md") as partial:
         partial.write_text(table + "\n")
-    write_json(details, folder / "results.json")
-    groups = {"MCP, new gate": [folder / "transfer"], "scratch": [folder / "scratch"]}
-    curves = analysis.learning_curves(groups, num_bins=20)
+    write_json({"rows": list(rows)}, folder / "results.json")
+    curves = analysis.learning_curves({TITLES[name]: [folder / name] for name in ("mcp", "scratch")}, num_bins=20)
     analysis.write_curves(curves, folder / "learning_curves.csv")
-    figure = analysis.draw_curves(curves, xlabel="environment steps on the held-out directions")
-    analysis.save_figure(figure, folder / "learning_curves")
-    panels = {PANELS[name][0]: analysis.load_trajectories(trajectory_file(folder, name)) for name in PANELS}
-    analysis.save_figure(analysis.draw_trajectories(panels), folder / "trajectories")
+    analysis.save_figure(analysis.draw_curves(curves), folder / "learning_curves")
     return table
 
 
-def evaluation_file(folder: Path, name: str) -> Path:
-    """Return the file of the evaluation of one of the :func:`policies`."""
-    return folder / "evaluation" / f"{name}.json"
+def caption(runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the caption of the table."""
+    return (
+        f"Normalised return of {rows[0]['episodes']} episodes with its 95 % interval, and with exploration.\n"
+        f"{remark(runs)} Seed {runs['mcp'].seed}, torchrl-mcp {__version__}."
+    )
 
 
-def trajectory_file(folder: Path, name: str) -> Path:
-    """Return the file of the trajectories of one of the ``PANELS``."""
-    return folder / "trajectories" / f"{name}.npz"
-
-
-def _table(lines: Mapping[str, Policy], results: Mapping[str, Mapping[str, dict]]) -> str:
-    """Return Markdown whose columns line up in a terminal."""
-    rows = []
-    for name, line in lines.items():
-        scores = {
-            mode: f"{numbers['normalised_return']:.3f} [{numbers['interval'][0]:.3f}, {numbers['interval'][1]:.3f}]"
-            for mode, numbers in results[name].items()
+def table_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return :func:`results` as text."""
+    return [
+        {
+            "policy": row["policy"],
+            "steps": f"{row['steps']:,}",
+            "steps before": f"{row['steps before']:,}",
+            "return": "{:.3f} [{:.3f}, {:.3f}]".format(
+                row["deterministic"]["normalised_return"], *row["deterministic"]["interval"]
+            ),
+            "exploring": f"{row['stochastic']['normalised_return']:.3f}",
+            "falls": f"{row['deterministic']['terminated']:.0%}",
         }
-        steps = {"steps": f"{line.steps:,}", "steps before": f"{line.pretraining_steps:,}"}
-        rows.append({"policy": line.label, **steps, **scores})
-    return text_table(rows, markdown=True)
+        for row in rows
+    ]
 
 
-def _steps_taken(folder: Path, runs: Runs) -> int:
-    """Environment steps of all runs so far."""
-    tables = (analysis.read_metrics(folder / name) for name in runs)
-    return sum(int(table[-1]["frames"]) for table in tables if table)
+def film(folder: Path, runs: Runs) -> bool:
+    """Film both policies under the same arrow, unless there is a film; return whether there is one.
+
+    No episode ends, so that the arrow, which is drawn from one seed, stays the same for both.
+    """
+    path, seconds = folder / FILM, runs["mcp"].demo.seconds
+    if path.exists():
+        return True
+    players = {}
+    for name in ("mcp", "scratch"):
+        fixed = {**runs[name].evaluation.environment, "terminate_on_fall": False, "max_episode_steps": 10**6}
+        _, agent, env = restore(folder / name, num_envs=1, seed=0, **fixed)
+        players[f"{TITLES[name]}, {_steps(runs[name]):,} steps"] = Player(agent.actor.policy, env)
+    try:
+        save_films(players, path, seconds=seconds, width=320, height=240)
+    except RuntimeError as error:
+        print(f"no film: {error}")
+        return False
+    return True
+
+
+def commands(folder: Path) -> dict[str, str]:
+    """Return the next commands by what each does."""
+    train = "torchrl-mcp-train method=mcp task=heading character=humanoid stage=transfer pretrained=builtin"
+    return {
+        "steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"]),
+        "train a gate yourself": f"{train} exploration=weights run_dir=runs/gate",
+        "pre-train the primitives yourself": "torchrl-mcp-demo --pretrain",
+    }
 
 
 def _steps(cfg: DictConfig) -> int:

@@ -1,4 +1,4 @@
-"""Progress bars on a terminal, all of one width."""
+"""Progress bars on a terminal."""
 
 import sys
 from typing import Any, TextIO
@@ -6,13 +6,20 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 WIDTH = 60
-"""Width of a bar in columns."""
+"""Columns of most bars."""
 
 
 def bar(
-    total: int | None, label: str, *, file: TextIO | None = None, leave: bool = False, form: str = "", **kwargs: Any
+    total: int | None,
+    label: str,
+    *,
+    file: TextIO | None = None,
+    leave: bool = False,
+    form: str = "",
+    width: int = WIDTH,
+    **kwargs: Any,
 ) -> tqdm:
-    """Return a bar of :data:`WIDTH` columns, which is hidden without a terminal.
+    """Return a bar, which is hidden without a terminal.
 
     Args:
         total: Number of steps, None if unknown.
@@ -20,12 +27,13 @@ def bar(
         file: The terminal, standard error by default.
         leave: Keep the bar when it is full.
         form: Text after the bar, in ``tqdm``'s ``bar_format``.
+        width: Columns of bar and texts.
         **kwargs: Passed on to ``tqdm``.
     """
     return tqdm(
         desc=label,
         total=total,
-        ncols=WIDTH,
+        ncols=width,
         file=file or sys.stderr,
         leave=leave,
         disable=None,

@@ -112,6 +112,7 @@ def _duration(seconds: float) -> str:
 
 FILTERS = {
     "figure": "{:.3f}".format,
+    "percent": "{:.0%}".format,
     "signed": lambda value: f"{value:+.3f}".replace("-", "−"),
     "steps": "{:,}".format,
     "duration": _duration,

@@ -43,6 +43,13 @@ REQUIRED = {
 }
 
 
+DEAD = "dead_units/"
+"""Beginning of the metrics with the share of dead units in the worst layer of a network."""
+
+MANY_DEAD = 1 / 3
+"""Share of dead units above which a run is remarked upon."""
+
+
 @dataclass(frozen=True)
 class Damaged:
     """A folder that cannot be read, and the reason."""
@@ -61,6 +68,7 @@ class Run:
         frames: Environment steps taken so far.
         seconds: Wall time of these steps.
         has_episodes: Whether an episode has ended, so that there is a learning curve.
+        dead_units: Share of dead units in the worst layer of each network after these steps.
         evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
         provenance: Commit, choices and machine at the start; empty for older runs.
         fault: Error in the run's files, or None.
@@ -71,6 +79,7 @@ class Run:
     frames: int = 0
     seconds: float = 0.0
     has_episodes: bool = False
+    dead_units: Mapping[str, float] = field(default_factory=dict)
     evaluation: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     fault: str | None = None
@@ -139,6 +148,13 @@ class Run:
     def progress(self) -> float:
         """Share of the steps taken so far, at most 1."""
         return min(1.0, self.frames / self.total_frames)
+
+    @property
+    def dying(self) -> dict[str, float]:
+        """The networks in which more than a third of a layer is dead after training."""
+        if self.state == "unfinished":
+            return {}
+        return {network: share for network, share in self.dead_units.items() if share > MANY_DEAD}
 
     @property
     def state(self) -> str:
@@ -219,6 +235,7 @@ def _progress(folder: Path) -> dict[str, Any]:
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],
         "has_episodes": any(math.isfinite(row[NORMALISED_RETURN]) for row in rows),
+        "dead_units": {name.removeprefix(DEAD): x for name, x in rows[-1].items() if name.startswith(DEAD)},
     }
 
 

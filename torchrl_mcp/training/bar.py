@@ -1,9 +1,8 @@
 """The progress of training on a terminal."""
 
-import math
 import sys
 import time
-from typing import TextIO
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
@@ -14,7 +13,7 @@ QUIET = 60.0
 
 
 class TrainingBar:
-    """Steps, time left and return of a training: a bar on a terminal, else a line every minute.
+    """Steps, speed, time left and a note on a training: a bar on a terminal, else a line every minute.
 
     Args:
         total: Environment steps of the training; the last batch may exceed it.
@@ -27,13 +26,12 @@ class TrainingBar:
         self._file = file or sys.stderr
         self._total, self._done, self._first, self._shown = total, done, done, shown
         self._began = self._told = time.monotonic()
-        self._return = math.nan
-        form = "{n_fmt}/{total_fmt} {elapsed}<{remaining}{postfix}"
+        self._note = ""
+        form = "{n_fmt}/{total_fmt} {rate_fmt} {elapsed}<{remaining}{postfix}"
         self._bar: tqdm | None = None
         if shown and self._file.isatty():
-            self._bar = bar(
-                total, "", file=self._file, leave=True, form=form, initial=min(done, total), unit_scale=True
-            )
+            scale: dict[str, Any] = {"initial": min(done, total), "unit": " steps", "unit_scale": True}
+            self._bar = bar(total, "", file=self._file, leave=True, form=form, width=80, **scale)
 
     def __enter__(self) -> "TrainingBar":
         """Return the bar."""
@@ -44,26 +42,24 @@ class TrainingBar:
         if self._bar is not None:
             self._bar.close()
 
-    def advance(self, steps: int, normalised_return: float) -> None:
+    def advance(self, steps: int, note: str = "") -> None:
         """Count a batch.
 
         Args:
             steps: Environment steps of the batch.
-            normalised_return: Mean over episodes that ended in the batch; NaN if none did, to keep showing the last.
+            note: What has been learned, such as a return; empty to keep showing the last.
         """
         self._done += steps
-        if math.isfinite(normalised_return):
-            self._return = normalised_return
-        shown = "" if math.isnan(self._return) else f"return {self._return:.3f}"
+        self._note = note or self._note
         if self._bar is not None:
-            self._bar.set_postfix_str(shown, refresh=False)
+            self._bar.set_postfix_str(self._note, refresh=False)
             self._bar.update(min(self._done, self._total) - self._bar.n)
         elif self._shown and time.monotonic() - self._told >= QUIET:
             self._told = time.monotonic()
-            print(self._line(shown), file=self._file, flush=True)
+            print(self._line(), file=self._file, flush=True)
 
-    def _line(self, shown: str) -> str:
+    def _line(self) -> str:
         speed = (self._done - self._first) / (self._told - self._began)
         left = f"{max(self._total - self._done, 0) / speed / 60:.0f} min left" if speed else ""
-        parts = [f"{self._done:,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, shown]
+        parts = [f"{self._done:,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, self._note]
         return ", ".join(filter(None, parts))

@@ -1,6 +1,5 @@
 """Dead units: hidden units that no input activates any more, so that no gradient reaches them."""
 
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -8,9 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-
-TOO_MANY = 0.2
-"""Share of dead units in a hidden layer above which the trainer warns."""
 
 MIN_SAMPLES = 64
 """Least number of samples to judge units by: an option that rarely acts sees fewer."""
@@ -25,13 +21,10 @@ class DeadUnits:
 
     def __init__(self, networks: nn.ModuleDict) -> None:
         self.layers = {name: layer for name, layer in networks.named_modules() if isinstance(layer, nn.ReLU)}
-        self._warned: set[str] = set()
 
     @torch.no_grad()
     def __call__(self, evaluate: Callable[[], Any]) -> dict[str, float]:
         """Return the share of dead units in the worst hidden layer of each network that ``evaluate`` runs.
-
-        A warning appears once for a layer, when its share passes :data:`TOO_MANY`.
 
         Args:
             evaluate: Evaluates networks on samples of one batch dimension.
@@ -51,19 +44,7 @@ class DeadUnits:
         for name, share in zip(shares, torch.stack([*shares.values()]).tolist(), strict=True):
             key = f"dead_units/{name.partition('.')[0]}"
             worst[key] = max(worst.get(key, 0.0), share)
-            self._warn(name, share)
         return worst
-
-    def _warn(self, layer: str, share: float) -> None:
-        if share <= TOO_MANY or layer in self._warned:
-            return
-        self._warned.add(layer)
-        step_size = "optimizer.critic.lr" if layer.startswith("critic") else "optimizer.schedule.max_lr"
-        warnings.warn(
-            f"{share:.0%} of the hidden units of {layer} are zero for all samples and learn no more: "
-            f"take smaller steps ({step_size})",
-            stacklevel=2,
-        )
 
 
 def _record(shares: dict[str, Tensor], name: str, layer: nn.Module, inputs: tuple[Tensor], output: Tensor) -> None:

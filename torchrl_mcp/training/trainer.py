@@ -180,7 +180,8 @@ class Trainer:
                     self._update_normalisers(batch)
                 self.frozen.verify()
                 self._advance(metrics, time.perf_counter() - start)
-                bar.advance(batch.numel(), metrics[NORMALISED_RETURN])
+                ended = metrics["episode/count"] > 0
+                bar.advance(batch.numel(), f"return {metrics[NORMALISED_RETURN]:.3f}" if ended else "")
 
     def _behaviour(self) -> TensorDictModuleBase:
         """Return the policy for collection, which writes only the keys that the loss reads."""

@@ -1,16 +1,17 @@
 """Films of policies."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
+from torchrl_mcp.analysis.figures import INK
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.rendering import Camera, save_gif
 from torchrl_mcp.envs.scenery import softly_lit
@@ -108,19 +109,48 @@ def save_film(
         RuntimeError: If no OpenGL library for drawing without a display is found.
         ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.viewer.formats.require_format`.
     """
-    require_format(path)
-    save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
-    path.parent.mkdir(parents=True, exist_ok=True)
     player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
-    every = EVERY[path.suffix]
-    interval = every * player.env.control_timestep
-    if round(seconds / player.env.control_timestep) < every:
+    save_films({"": player}, path, seconds=seconds, width=width, height=height)
+
+
+def save_films(players: Mapping[str, Player], path: Path, *, seconds: float, width: int, height: int) -> None:
+    """Write the :func:`film` of every player, side by side in one animated GIF or MP4.
+
+    Args:
+        players: Players by the titles of their pictures, with equal control steps.
+        path: The file, ``.gif`` or ``.mp4``.
+        seconds: Duration in seconds.
+        width: Width of each player's picture in pixels.
+        height: Height in pixels.
+
+    Raises:
+        RuntimeError: If no OpenGL library for drawing without a display is found.
+        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.viewer.formats.require_format`.
+    """
+    require_format(path)
+    save, every = {".gif": save_gif, ".mp4": save_mp4}[path.suffix], EVERY[path.suffix]
+    timestep = next(iter(players.values())).env.control_timestep
+    interval = every * timestep
+    if round(seconds / timestep) < every:
         raise ValueError(f"seconds={seconds} is too short for a picture: pass at least {interval:.2f}")
     if width < 2 or height < 2:
         raise ValueError(f"width={width} and height={height} are too small for a picture: pass at least 2 pixels each")
-    pictures = film(player, seconds=seconds, width=width, height=height, every=every)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    films = [film(player, seconds=seconds, width=width, height=height, every=every) for player in players.values()]
+    pictures = (_beside(row, list(players)) for row in zip(*films, strict=True))
     with bar(round(seconds / interval), path.name) as shown:
         save(_counted(pictures, shown), path, interval=interval)
+
+
+def _beside(pictures: Sequence[Image.Image], titles: Sequence[str]) -> Image.Image:
+    """Return pictures of one size in a row, each with its title at the bottom."""
+    width, height = pictures[0].size
+    row = Image.new("RGB", (len(pictures) * width, height))
+    draw, font = ImageDraw.Draw(row), ImageFont.load_default(height / 14)
+    for column, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
+        row.paste(picture, (column * width, 0))
+        draw.text(((column + 0.5) * width, 0.97 * height), title, fill=INK, font=font, anchor="mb")
+    return row
 
 
 def _counted(pictures: Iterable[Image.Image], shown: tqdm) -> Iterator[Image.Image]:
