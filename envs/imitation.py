@@ -6,7 +6,6 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.adaptive_sampler import AdaptiveSampler
 from torchrl_mcp.envs.arguments import not_negative
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.imitation_reward import Term, imitation_rewards, mismatch, squared_angles, squared_distances
@@ -57,9 +56,6 @@ class Imitation(PDCharacterEnv):
     ``max_error`` from the reference. The end of a clip that does not loop truncates the episode, as the time limit
     does.
 
-    With probability ``failure_weighting`` a moment is drawn where episodes end often, see
-    :class:`~torchrl_mcp.envs.adaptive_sampler.AdaptiveSampler`, and otherwise uniformly.
-
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         clips: Reference motions of that character: a library, or clips by name.
@@ -75,7 +71,6 @@ class Imitation(PDCharacterEnv):
             away and does not observe it.
         clip_end: Action at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
             another reference, so that every episode lasts until its time limit or a failure.
-        failure_weighting: Probability of drawing a moment where episodes end often, rather than uniformly.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -101,7 +96,6 @@ class Imitation(PDCharacterEnv):
         switch_candidates: int = 1,
         switch_to: str = "any",
         clip_end: str = "truncate",
-        failure_weighting: float = 0.0,
         max_episode_steps: int = 300,
         **kwargs: Any,
     ) -> None:
@@ -114,8 +108,6 @@ class Imitation(PDCharacterEnv):
         if library.character != character:
             raise ValueError(f"clips are of {library.character}: pass motions of character={character!r}")
         not_negative(max_error=max_error)
-        if not 0 <= failure_weighting <= 1:
-            raise ValueError(f"failure_weighting={failure_weighting} is out of range: pass 0 (none) to 1")
         if not switch_interval > 0:
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
         if switch_candidates < 1:
@@ -128,7 +120,6 @@ class Imitation(PDCharacterEnv):
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
-        self.failure_weighting = failure_weighting
         names = library.body_names
         reference = {
             "clip": torch.zeros((), dtype=torch.int64),
@@ -144,7 +135,6 @@ class Imitation(PDCharacterEnv):
         ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
         self._ahead = ahead.unsqueeze(-1).to(self.device)
         self._horizontal = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device=self.device)
-        self._sampler = AdaptiveSampler(self.library)
         model, own = self.simulation.model, slice(1, 1 + len(self._bodies))
         masses, centres = (torch.from_numpy(field[own]) for field in (model.body_mass, model.body_ipos))
         self._masses, self._centres_of_mass = masses.to(self.device), centres.to(self.device)
@@ -182,9 +172,8 @@ class Imitation(PDCharacterEnv):
         }
 
     def get_extra_state(self) -> dict[str, Any]:
-        """See :meth:`CharacterEnv.get_extra_state`; adds a digest of the motions and the sampler's counts."""
-        own = {"motions": self.library.digest, "sampler": self._sampler.state_dict()}
-        return {**super().get_extra_state(), **own}
+        """See :meth:`CharacterEnv.get_extra_state`; adds a digest of the motions."""
+        return {**super().get_extra_state(), "motions": self.library.digest}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore a result of :meth:`get_extra_state`.
@@ -198,7 +187,6 @@ class Imitation(PDCharacterEnv):
                 "begin another from it with stage=pretrain pretrained=<folder>"
             )
         super().set_extra_state(state)
-        self._sampler.load_state_dict(state["sampler"])
 
     def _sample(self, num: int) -> dict[str, Tensor]:
         return self.beginning(*self._draw(num))
@@ -208,12 +196,7 @@ class Imitation(PDCharacterEnv):
         if clips is not None:
             shares = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
             return clips, shares * self.library.durations[clips]
-        clips, times = self.library.sample(num, self.generator)
-        if not self.failure_weighting:
-            return clips, times
-        hard = torch.rand(num, generator=self.generator, device=self.device) < self.failure_weighting
-        others = self._sampler.draw(num, self.generator)
-        return torch.where(hard, others[0], clips), torch.where(hard, others[1], times)
+        return self.library.sample(num, self.generator)
 
     def _goal_mirror(self) -> Mirror:
         return mirror_bodies(self._bodies, repeats=NUM_TARGETS)
@@ -252,11 +235,8 @@ class Imitation(PDCharacterEnv):
         lost = self.episode["error"].copy_(error) > self.max_error
         rewards = imitation_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
         reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
-        ended = fallen | lost
-        if self.failure_weighting:
-            self._sampler.count(self.episode["clip"], self.episode["time"], ended)
         self._switch()
-        return reward.masked_fill(lost, 0.0), ended
+        return reward.masked_fill(lost, 0.0), fallen | lost
 
     def _switch(self) -> None:
         """Change the references of some simulations to a similar moment, at the character's position and heading."""

@@ -1,4 +1,4 @@
-"""The base class of tasks for pre-trained characters: initial states, and shaping of the reward."""
+"""The base class of tasks for pre-trained characters: aids for training."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -8,14 +8,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative
-from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.beginnings import Beginnings
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.ranges import Ranges
-from torchrl_mcp.envs.shaping import Ramp, potential, shaping_reward
 
 TASK_REWARD = "task_reward"
 """Key of the task's own reward in environments that train on another reward."""
@@ -33,8 +30,8 @@ def task_reward(outcome: TensorDictBase) -> Tensor:
 class TransferTask(PDCharacterEnv):
     """A task for characters that can walk, with aids for training that are off by default.
 
-    Episodes may begin in motion, and in easier situations than those of the task. Training may use another reward, and
-    shaping may add rewards for progress; ``task_reward`` (1) is then the task's own, beside ``reward``.
+    Episodes may begin in motion, and in easier situations than those of the task. Training may use another reward;
+    ``task_reward`` (1) is then the task's own, beside ``reward``.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -44,9 +41,7 @@ class TransferTask(PDCharacterEnv):
         initial_states: ``"rest"``, ``"motions"`` or a weight for each, see
             :class:`~torchrl_mcp.envs.beginnings.Beginnings`.
         motions: Motions for initial states, None for the generated ones.
-        shaping: ``slope`` and ``reach`` of the :func:`~torchrl_mcp.envs.shaping.potential` by the names of the task's
-            distances; None for no shaping. A fallen character has potential 0.
-        discount: Discount factor of the learner, for shaping.
+        discount: Discount factor of the learner.
         staggered: Shorten the first episodes by different lengths, so that simulations are at different times of their
             episodes: otherwise a batch of short trajectories would cover a single time.
         practised: Whether training uses another reward than the task's.
@@ -57,9 +52,6 @@ class TransferTask(PDCharacterEnv):
         ValueError: If an argument is out of range.
     """
 
-    distances: tuple[str, ...] = ()
-    """Names of the distances that the task shortens, for shaping."""
-
     def __init__(
         self,
         character: str,
@@ -69,7 +61,6 @@ class TransferTask(PDCharacterEnv):
         mixture: Sequence[Mapping[str, Any]] = (),
         initial_states: str | Mapping[str, float] = "rest",
         motions: MotionLibrary | Mapping[str, MotionClip] | None = None,
-        shaping: Mapping[str, Mapping[str, float]] | None = None,
         discount: float = 0.99,
         staggered: bool = False,
         practised: bool = False,
@@ -77,17 +68,10 @@ class TransferTask(PDCharacterEnv):
         **kwargs: Any,
     ) -> None:
         self.ranges = Ranges(ranges, mixture)
-        ramps = {name: Ramp(**ramp) for name, ramp in (shaping or {}).items()}
-        if unknown := set(ramps) - set(self.distances):
-            raise ValueError(f"shaping names {sorted(unknown)}: pass slope and reach of {list(self.distances)}")
-        for name, ramp in ramps.items():
-            not_negative(**{f"shaping.{name}.{part}": value for part, value in ramp._asdict().items()})
         if not 0 < discount <= 1:
             raise ValueError(f"discount={discount} is out of range: pass the learner's, above 0 and at most 1")
-        self.shaping, self.discount = ramps, discount
-        self.staggered, self._practised = staggered, practised or bool(ramps)
-        names = [*(["potential"] if ramps else []), *([TASK_REWARD] if self._practised else [])]
-        remembered = {name: torch.zeros((), dtype=torch.float64) for name in names}
+        self.discount, self.staggered, self._practised = discount, staggered, practised
+        remembered = {TASK_REWARD: torch.zeros((), dtype=torch.float64)} if practised else {}
         super().__init__(character, num_envs, episode={**remembered, **episode}, **kwargs)
         self.ranges.to(self.device)
         self.beginnings = Beginnings(character, initial_states, motions, self.device)
@@ -102,8 +86,6 @@ class TransferTask(PDCharacterEnv):
         begun = super()._begin(ids)
         if self._practised:
             begun[TASK_REWARD] = torch.zeros_like(self.episode[TASK_REWARD][ids])
-        if self.shaping:
-            begun["potential"] = self._potential(ids)
         if self.staggered and len(ids) == self.num_envs:
             begun["elapsed_steps"] = (ids * self.max_episode_steps // self.num_envs).unsqueeze(-1)
         return begun
@@ -116,23 +98,9 @@ class TransferTask(PDCharacterEnv):
 
     def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         rewards, terminated = self._unless_fallen(self._rewards())
-        reward = rewards[-1]
         if self._practised:
             self.episode[TASK_REWARD].copy_(rewards[0])[diverged] = 0.0
-        if self.shaping:
-            before = self.episode["potential"].clone()
-            after = self.episode["potential"].copy_(self._potential(ALL))
-            reward = reward + shaping_reward(before, after, self.discount)
-        return reward, terminated
-
-    def _potential(self, ids: Tensor | slice) -> Tensor:
-        """Potential of simulations, ``(n,)``: 0 after a fall."""
-        standing = potential(self._distances(ids), self.shaping)
-        return standing.masked_fill(self.fallen()[ids], 0.0)
-
-    def _distances(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        """The distances that the task shortens, by name, each ``(n,)`` in metres."""
-        return {}
+        return rewards[-1], terminated
 
     @abstractmethod
     def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:

@@ -66,14 +66,12 @@ class Transport(TransferTask):
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         episode: Initial task state of one simulation, in addition to the object's position.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`: aids for training. Shaping has two
-            distances: ``object``, from the character to the object, and ``target``, from the object to the target.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`: aids for training.
 
     Raises:
         ValueError: If an argument is out of range.
     """
 
-    distances = ("object", "target")
     success_distance = SUCCESS_DISTANCE
     """Metres between object and target at which an ideal player has succeeded."""
 
@@ -112,8 +110,6 @@ class Transport(TransferTask):
             raise ValueError(
                 "emphasis with discount=1: a success is worth full reward for ever, pass a discount below 1"
             )
-        if emphasis is not None and kwargs.get("shaping"):
-            raise ValueError("emphasis with shaping: both reward progress in training, pass one of them")
         self._reward = partial(reward, speed=speed, target_distance_power=target_distance_power)
         self._emphasised, self._idle, self._full = None, 0.0, 1.0
         if emphasis is not None:
@@ -205,11 +201,6 @@ class Transport(TransferTask):
             "goal": torch.cat(shown, -1),
             "success": self.success()[ids].unsqueeze(-1),
         }
-
-    def _distances(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        com, thing, target = (part[ids, :2] for part in (self._com, self._object, self._target))
-        ways = {"object": thing - com, "target": target - thing}
-        return {name: torch.linalg.vector_norm(way, dim=-1) for name, way in ways.items()}
 
     def _rewards(self) -> Tensor:
         object_velocity = (self._object - self.episode["object"]) / self.control_timestep

@@ -212,7 +212,7 @@ def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_pat
     settings += ["logger=none", "progress_bar=false", "num_threads=1", "checkpoint_interval=1", "evaluation.episodes=0"]
     settings += ["training.total_frames=256", "keep_checkpoints=9", "task.evaluation.max_episode_steps=4"]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        for name in ("printed", "shaping"):
+        for name in ("printed", "emphasis"):
             experiment.train(compose("train", [*settings, f"practice={name}", f"run_dir={tmp_path / 'runs' / name}"]))
     monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.setattr(
@@ -221,10 +221,10 @@ def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_pat
     runpy.run_path(str(BENCHMARKS / "practice.py"), run_name="__main__")
     with (tmp_path / "practice.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["practice"], row["steps"]) for row in rows] == list(product(("printed", "shaping"), ("128", "256")))
-    cfg = policies.policy_config(tmp_path / "runs" / "shaping")
+    assert [(row["practice"], row["steps"]) for row in rows] == list(product(("printed", "emphasis"), ("128", "256")))
+    cfg = policies.policy_config(tmp_path / "runs" / "emphasis")
     found = policies.evaluate_run(
-        tmp_path / "runs" / "shaping", episodes=3, seed=cfg.evaluation.seed, **cfg.evaluation.environment
+        tmp_path / "runs" / "emphasis", episodes=3, seed=cfg.evaluation.seed, **cfg.evaluation.environment
     )["deterministic"]
     assert float(rows[-1]["normalised_return"]) == pytest.approx(found["normalised_return"], abs=1e-4)
     assert float(rows[-1]["success"]) == found["metrics"]["success"]

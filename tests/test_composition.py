@@ -105,7 +105,7 @@ def test_transfer_keeps_and_freezes_what_the_paper_says(method):
 
 
 ANYWHERE = [-3.141592653589793, 3.141592653589793]
-PLAIN = {"initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "shaping": {}, "staggered": False}
+PLAIN = {"initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "staggered": False}
 PLAIN |= {"terminate_on_fall": True, "self_collision": False, "friction_cone": "pyramidal", "physics_timestep": None}
 OBJECT = PLAIN | {"target_distances": [0.0, 10.0], "object_directions": ANYWHERE, "target_directions": ANYWHERE}
 OBJECT |= {

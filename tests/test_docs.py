@@ -39,7 +39,7 @@ EVERYTHING = (
     "method=mcp task=imitation character=biped",
     "method=mcp task=heading character=biped stage=transfer",
     "method=mcp task=carry character=biped stage=transfer",
-    "method=mcp exploration=correlated_weights stage=transfer",
+    "method=mcp exploration=weights stage=transfer",
     "method=mcp preset=paper",
     "method=hierarchical task=heading character=biped stage=transfer",
     "method=option_critic task=imitation character=biped",

@@ -29,7 +29,7 @@ def place(file):
 FILES = sorted((Path(conf.__file__).parent / "method").glob("*.yaml"))
 CASES = {file.stem: (file.stem, place(file)) for file in FILES}
 CASES["finetune to the same goal"] = ("finetune", ANT)
-CASES["mcp with correlated noise"] = ("mcp", (ANT[0], [*ANT[1], "exploration=correlated_weights"]))
+CASES["mcp over weights"] = ("mcp", (ANT[0], [*ANT[1], "exploration=weights"]))
 
 SMALL = [
     "training.frames_per_batch=64",

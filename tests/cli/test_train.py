@@ -36,7 +36,7 @@ def test_every_choice_of_every_group_composes(choices):
 
 @pytest.mark.parametrize(
     ("task", "practice", "mixture"),
-    [("holdout", "emphasis", 0), ("holdout", "shaping", 0), ("dribble", "shaping", 3)],
+    [("holdout", "emphasis", 0), ("heading", "emphasis", 0), ("carry", "printed", 0)],
 )
 def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, practice, mixture):
     arguments = [f"task={task}", f"practice={practice}", "stage=transfer", "--cfg", "job", "--resolve"]

@@ -208,35 +208,6 @@ def test_a_reference_may_stay_the_same_and_come_back_to_the_character():
         make(switch_to="other")
 
 
-def test_where_references_are_lost_they_come_back_more_often():
-    clips = {"still": gliding("biped", loop=True), "other": gliding("biped", seconds=3.0)}
-    env = make(num_envs=3000, clips=clips, failure_weighting=0.6)
-    env.reset()
-    assert (env.episode["clip"] == 0).double().mean().item() == pytest.approx(2 / 5, abs=0.04)
-    sampler = env._sampler
-    for step in range(2000):  # seconds 0 and 1 of the first, 0 to 2 of the second, whose last is lost every fifth time
-        clip, time = torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0.5, 7.5, 0.5, 1.5, 2.5]).double()
-        sampler.count(clip, time, torch.tensor([False, False, False, False, step % 5 == 0]))
-    env.reset()
-    hard = (env.episode["clip"] == 1) & (env.episode["time"] >= 1.0)
-    assert hard.double().mean().item() == pytest.approx(0.4 * 2 / 5 + 0.6 * 0.95, abs=0.06)
-
-
-def test_failures_are_counted_by_the_second_and_survive_a_checkpoint():
-    clips = {"still": gliding("biped", loop=True), "other": gliding("biped", turn=TURN, loop=True)}
-    env, copy = (make(num_envs=4, clips=clips, failure_weighting=1.0, max_error=0.3) for _ in range(2))
-    env.reset()
-    state = env.get_state()
-    state["clip"], state["time"] = torch.tensor([0, 1, 1, 1]), torch.tensor([0.2, 0.2, 1.2, 3.2]).double()
-    state["qpos"][:, 1] += 10.0  # all are lost
-    idle(env, env.reset(state, set_state=True))
-    failures = env._sampler.failures
-    torch.testing.assert_close(failures, torch.tensor([2.0, 1.0, 2.0, 3.0]).double(), atol=1e-2, rtol=0)
-    copy.load_state_dict(env.state_dict())
-    assert torch.equal(copy._sampler.failures, failures)
-    assert torch.equal(copy._sampler.steps, env._sampler.steps)
-
-
 def test_the_terms_of_the_reward_are_told():
     env = make(num_envs=2)
     outcome = idle(env, env.reset())
@@ -270,8 +241,6 @@ def test_motions_and_terms_are_checked():
         make(terms={"posture": {"weight": 1.0, "scale": 1.0}})
     with pytest.raises(ValueError, match="switch_interval=0"):
         make(switch_interval=0)
-    with pytest.raises(ValueError, match=r"failure_weighting=1\.5"):
-        make(failure_weighting=1.5)
 
 
 def test_the_best_possible_return_is_one():

@@ -74,11 +74,6 @@ def test_full_reward_for_ever_needs_a_discount():
         make(Dribble, emphasis=EMPHASIS, discount=1)
 
 
-def test_emphasis_and_shaping_exclude_each_other():
-    with pytest.raises(ValueError, match=r"emphasis with shaping: .* pass one of them"):
-        make(Dribble, emphasis=EMPHASIS, shaping={"object": {"slope": 1.0, "reach": 5.0}})
-
-
 def test_without_emphasis_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     outcome = outcomes(make(Dribble, **there), 1)[0][0]

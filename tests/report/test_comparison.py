@@ -162,10 +162,10 @@ def test_a_method_s_own_settings_are_standard_in_both_stages(write_mcp):
 
 
 def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
-    evaluated = {"speed": 1.0, "initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "shaping": {}}
+    evaluated = {"speed": 1.0, "initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": []}
     evaluated["emphasis"] = None
     trained = {**evaluated, "speed": 1.0, "initial_states": {"rest": 0.2, "motions": 0.8}, "mixture": [{"weight": 2}]}
-    trained |= {"shaping": {"object": {"slope": 1.0}}, "emphasis": {"discount": 0.9}}
+    trained |= {"emphasis": {"discount": 0.9}}
     runs = {"plain": evaluated, "practised": trained}
     plain, practised = grouped(
         *(
@@ -178,7 +178,7 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
         "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, "
-        "mixture=[{'weight': 2}], shaping.object.slope=1.0, emphasis.discount=0.9"
+        "mixture=[{'weight': 2}], emphasis.discount=0.9"
     )
 
 
@@ -237,7 +237,7 @@ def test_methods_have_colours_of_their_own_those_of_table_2_first(write_run):
         ("num_primitives", "num_primitives", [4, 8, 16]),
         ("mixer", "mixer__name", ["additive", "multiplicative"]),
         ("exploration", "exploration__name", ["action", "weights"]),
-        ("practice", "practice__name", ["printed", "shaping"]),
+        ("practice", "practice__name", ["emphasis", "printed"]),
     ],
 )
 def test_an_ablation_holds_the_cells_that_differ_in_its_setting_alone(write_mcp, write_run, setting, key, values):

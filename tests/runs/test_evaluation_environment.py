@@ -45,7 +45,6 @@ OTHER = {
     "target_distances": [1.0, 2.0],
     "target_directions": [0.5, 0.6],
     "mixture": [{"weight": 2.0}],
-    "shaping": {"object": {"slope": 1.0, "reach": 4.0}},
     "discount": 0.5,
     "staggered": True,
     "goal_positions": "metres",
@@ -70,7 +69,6 @@ OTHER = {
     "switch_interval": 1.0,
     "switch_candidates": 2,
     "clip_end": "truncate",
-    "failure_weighting": 0.5,
     "max_error": 0.1,
 }
 """Another value of every setting than that of the evaluation."""
@@ -96,8 +94,7 @@ def trained_otherwise(task):
     """A configuration in which every setting of the training's environment has another value."""
     cfg, place = configure(task), "imitation" if task == "imitation" else f"task.{STAGES[task]}"
     for name in evaluated_as(cfg).keys() - RUNS_OWN.get(task, set()):
-        if name != "shaping" or task != "heading":  # which has no distance to shape
-            OmegaConf.update(cfg, f"{place}.{name}", OTHER[name], merge=False, force_add=True)
+        OmegaConf.update(cfg, f"{place}.{name}", OTHER[name], merge=False, force_add=True)
     return cfg
 
 
@@ -142,7 +139,7 @@ def test_what_training_uses_would_make_another_evaluation(task):
     cfg = trained_otherwise(task)
     trained = OmegaConf.to_container(cfg.task[STAGES[task]], resolve=True)
     for name, value in evaluated_as(cfg).items():
-        if name not in RUNS_OWN.get(task, set()) and (name != "shaping" or task != "heading"):
+        if name not in RUNS_OWN.get(task, set()):
             assert trained[name] != value, name
 
 
@@ -153,13 +150,13 @@ def test_near_objects_of_training_are_clear_of_every_character(task, character):
     build.make_env(cfg, num_envs=2, seed=0).reset()
 
 
-@pytest.mark.parametrize("practice", ["printed", "beginnings", "ranges", "shaping", "emphasis"])
+@pytest.mark.parametrize("practice", ["printed", "emphasis"])
 @pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
 def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):
     cfg = configure(task, f"practice={practice}")
     assert evaluated_as(cfg) == evaluated_as(configure(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
-    another = practice in ("shaping", "emphasis") and task != "heading"
+    another = practice == "emphasis" and task != "heading"
     assert ("task_reward" in env.rollout(2)["next"]) == another
 
 

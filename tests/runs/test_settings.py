@@ -129,7 +129,7 @@ def test_no_setting_takes_a_run_out_of_the_folder_of_runs():
 
 WITHOUT_RULE = {
     *("_target_", "_partial_", "name", "title", "budget", "character", "path", "clips", "clip_end", "goal", "gating"),
-    *("primitives", "mixer", "trained", "dim", "interval", "explorer", "environment", "schedule", "mixture", "shaping"),
+    *("primitives", "mixer", "trained", "dim", "interval", "explorer", "environment", "schedule", "mixture"),
     *("logger_name", "logger_type", "experiment_name", "backend", "address", "include_dashboard", "log_to_driver"),
     *("num_cpus", "num_gpus", "memory", "distribution_class", "gate_activation", "transforms", "benchmark", "logger"),
     "emphasis",

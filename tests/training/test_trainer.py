@@ -114,7 +114,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pre
     assert rows(tmp_path / "other") != rows(pretrained)
 
 
-@pytest.mark.parametrize("exploration", ["action", "weights", "correlated_weights"])
+@pytest.mark.parametrize("exploration", ["action", "weights"])
 def test_transfer_keeps_the_primitives_to_the_bit_and_trains_a_new_gate(tmp_path, pretrained, exploration):
     folder = tmp_path / exploration
     experiment.train(configure(folder, "stage=transfer", f"exploration={exploration}", f"pretrained={pretrained}"))

@@ -21,7 +21,7 @@ class Evaluation:
     """The outcome of one episode per environment.
 
     Attributes:
-        returns: Undiscounted sum of rewards of each episode, without shaping, ``(N,)``.
+        returns: Undiscounted sum of the task's own rewards of each episode, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
         positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.

@@ -10,7 +10,6 @@ the primitives are frozen, the exploration acts on the gate, or noise enters bef
 | ``normalised`` / ``observation``, ``goal`` | the same, standardised and clipped | |
 | ``gate_logits``, ``gates`` | before and after the gate's activation | ``(*B, K)`` |
 | ``primitives`` / ``loc``, ``scale`` | means and standard deviations of the primitives | ``(*B, K, A)`` |
-| ``noise`` | from the environment, for exploration alone | ``(*B, K)`` |
 | ``action`` | input of the environment | ``(*B, A)`` |
 """
 
@@ -34,8 +33,6 @@ from torchrl_mcp.modules.normaliser import RunningNormaliser
 STATE = ("normalised", "observation")
 GOAL = ("normalised", "goal")
 PRIMITIVES = (("primitives", "loc"), ("primitives", "scale"))
-NOISE = "noise"
-"""Read by policies that explore, and ignored by their deterministic actions."""
 
 Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
 

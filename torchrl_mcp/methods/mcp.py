@@ -3,7 +3,7 @@
 The mixture of experts (Section E.6) has the same parts and actor, with another mixer, gate and primitives.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
@@ -126,7 +126,6 @@ def weights_actor(
     gate_activation: nn.Module,
     distribution_class: Composition,
     logits_std: float,
-    noise: str | None = None,
     frozen: Collection[str] = (),
 ) -> Actor:
     r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
@@ -139,8 +138,6 @@ def weights_actor(
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
         logits_std: Standard deviation of the logits.
-        noise: Key of standard normal noise ``(*B, K)`` for the logits, such as the key of
-            :class:`~torchrl_mcp.methods.transforms.CorrelatedNoise`; None draws independent noise in each step.
         frozen: Names of the parts that do not change in training.
 
     Raises:
@@ -158,10 +155,9 @@ def weights_actor(
     )
     normal = {"loc": "gate_loc", "scale": "gate_scale"}
     trained = ProbabilisticTensorDictSequential(*gate, sampler("gate_logits", IndependentNormal, **normal))
-    drawn = sampler("gate_logits", NormalOfNoise, **normal, noise=noise) if noise else trained[-1]
     policy = TensorDictSequential(
         *gate,
-        drawn,
+        trained[-1],
         TensorDictModule(gate_activation, in_keys=["gate_logits"], out_keys=["gates"]),
         TensorDictModule(parts["primitives"], in_keys=[STATE], out_keys=list(PRIMITIVES)),
         TensorDictModule(DeterministicAction(distribution_class), in_keys=[*PRIMITIVES, "gates"], out_keys=["action"]),
@@ -199,38 +195,6 @@ def random_weights(
         return composite(loc, scale, gates)
 
     return explore
-
-
-class NormalOfNoise(IndependentNormal):
-    """A normal distribution that samples with given noise; its density is the usual one.
-
-    With noise that is correlated in time, successive samples are correlated, and each has the same marginal.
-    PPO's ratio is a ratio of marginals, as in Hollenstein et al. (2024).
-
-    Args:
-        loc: Mean, shape ``(*B, K)``.
-        scale: Standard deviation, shape ``(*B, K)``.
-        noise: Standard normal noise, shape ``(*B, K)``.
-    """
-
-    def __init__(self, loc: Tensor, scale: Tensor, noise: Tensor) -> None:
-        super().__init__(loc, scale)
-        self._noise = noise
-
-    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """Return the sample that belongs to the noise, ``(*B, K)``.
-
-        Raises:
-            ValueError: If ``sample_shape`` is not empty: the noise is for one sample.
-        """
-        if sample_shape:
-            raise ValueError(f"sample_shape={tuple(sample_shape)}: there is noise for one sample")
-        return self.base_dist.loc + self.base_dist.scale * self._noise
-
-    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
-        """Return the sample of :meth:`rsample`, without gradients."""
-        with torch.no_grad():
-            return self.rsample(sample_shape)
 
 
 class ConstantScale(nn.Module):

@@ -11,8 +11,6 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
-from torchrl_mcp.methods.actor import NOISE
-
 
 class TransformedCharacterEnv(TransformedEnv):
     """Environments with transforms; the state of both can be set, saved and restored.
@@ -80,67 +78,6 @@ class OptionMemory(Transform):
             self._held = {"held_option": nothing, "held_steps": nothing}
         self._restored = False
         return tensordict_reset.update(self.get_extra_state())
-
-
-class CorrelatedNoise(Transform):
-    r"""A transform that adds slowly changing standard normal noise, with which a policy explores.
-
-    .. math:: \epsilon_t = \rho\, \epsilon_{t-1} + \sqrt{1 - \rho^2}\, \xi_t, \quad \xi_t \sim \mathcal{N}(0, 1)
-
-    ``noise`` is ``(N, size)``, independent between environments and components. It is drawn anew at the beginning of
-    an episode, from torch's generator of the device.
-
-    The current noise is part of ``state_dict``: the next reset of all environments after loading returns to it.
-
-    Args:
-        size: Number of components.
-        correlation: Correlation :math:`\rho` of successive steps: noise lasts for about :math:`1 / (1 - \rho)` steps.
-
-    Raises:
-        ValueError: If the correlation is not at least 0 and below 1.
-
-    Reference:
-        Hollenstein et al., *Colored Noise in PPO: Improved Exploration and Performance through Correlated Action
-        Sampling*, AAAI 2024. https://arxiv.org/abs/2312.11091
-    """
-
-    def __init__(self, size: int, correlation: float) -> None:
-        super().__init__()
-        if not 0 <= correlation < 1:
-            raise ValueError(f"correlation={correlation} must be at least 0 and below 1")
-        self.size, self.correlation = size, correlation
-        self._noise = torch.empty(0)
-        self._restored = False
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add ``noise``."""
-        if not isinstance(observation_spec, Composite):
-            raise TypeError(f"the environment observes {observation_spec}, which has no names: a Composite is needed")
-        device = observation_spec.device
-        observation_spec[NOISE] = Unbounded(shape=(*observation_spec.shape, self.size), device=device)
-        return observation_spec
-
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """Return the current noise."""
-        return {"noise": self._noise.clone()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the state of :meth:`get_extra_state`."""
-        self._noise, self._restored = state["noise"].clone(), bool(len(state["noise"]))
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        noise = tensordict[NOISE]
-        innovation = torch.randn_like(noise).mul_((1 - self.correlation**2) ** 0.5)
-        self._noise = innovation.add_(noise, alpha=self.correlation)
-        return next_tensordict.set(NOISE, self._noise)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if not self._restored:
-            shape, device = (*tensordict_reset.batch_size, self.size), tensordict_reset.device
-            fresh, mask = torch.randn(shape, device=device), tensordict.get("_reset", None)
-            self._noise = fresh if mask is None else torch.where(mask, fresh, self._noise)
-        self._restored = False
-        return tensordict_reset.set(NOISE, self._noise)
 
 
 class ClipAsOption(Transform):

@@ -140,7 +140,7 @@ class Run:
             {name.removeprefix(prefix): value for name, value in self.settings.items() if name.startswith(prefix)}
             for prefix in ("task.transfer.", "task.evaluation.")
         )
-        shared = (name for name in trained if name in evaluated or name.startswith(("shaping.", "emphasis.")))
+        shared = (name for name in trained if name in evaluated or name.startswith(("emphasis.",)))
         different = [f"{name}={trained[name]}" for name in shared if trained[name] != evaluated.get(name)]
         return [", ".join(different)] if different else []
 

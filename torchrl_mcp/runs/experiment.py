@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_mcp.runs import build, lock
 from torchrl_mcp.runs.build import make_agent, make_source, make_trainer
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.earlier import require_resumable, translated
 from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.policies import evaluation
@@ -100,7 +101,7 @@ def run_config(folder: Path) -> DictConfig:
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     config = read_config(folder / CONFIG)
     build.require_known(config, folder / CONFIG)
-    return OmegaConf.create(config)
+    return OmegaConf.create(translated(config))
 
 
 def is_complete(folder: Path) -> bool:
@@ -154,6 +155,7 @@ def _train(cfg: DictConfig) -> Path:
 def _resume(folder: Path, device: str | None = None) -> Path:
     if is_complete(folder):
         return folder
+    require_resumable(read_config(folder / CONFIG))
     cfg = run_config(folder)
     cfg.device = device or cfg.device
     build.require_equipment(cfg)
@@ -190,7 +192,7 @@ def _require_same_run(cfg: DictConfig, path: Path) -> None:
     wanted = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
     held, wanted = (
         {**config, "training": {**config["training"], "total_frames": None}}
-        for config in (checkpoint.saved_config(path), wanted)
+        for config in (translated(checkpoint.saved_config(path)), wanted)
     )
     if changed := differences(held, wanted, CONDUCT | PLACES | {"evaluation", "budget"}):
         raise ValueError(

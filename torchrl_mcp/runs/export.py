@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.methods.actor import NOISE
 from torchrl_mcp.runs import policies
 from torchrl_mcp.training.run_folder import replacing
 
@@ -29,7 +28,7 @@ class DeterministicPolicy(nn.Module):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        if others := [str(key) for key in policy.in_keys if key not in (*INPUTS, NOISE)]:
+        if others := [str(key) for key in policy.in_keys if key not in INPUTS]:
             raise ValueError(
                 f"the policy also reads {', '.join(others)}, which an environment remembers between steps: only "
                 f"policies of {' and '.join(INPUTS)} can be exported"

@@ -67,24 +67,24 @@ NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
         num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor checkpoint_interval
         keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options latent_dim
-        steps_per_choice explorer.steps size
+        steps_per_choice explorer.steps
     """,
     COUNT.or_null(): "torch_threads record_interval practice.max_episode_steps",
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
     SEED: "seed",
     POSITIVE: """
         lr critic_lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale
-        reach speed max_error width kept_width
+        speed max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",
     NOT_NEGATIVE: """
-        bound_coeff coeff kl_coeff termination_cost weight failure_weighting max_turn slope
+        bound_coeff coeff kl_coeff termination_cost weight max_turn
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     DISCOUNT: "gamma",
     SHARE: """
-        lmbda discount epsilon momentum correlation terminations.initial initial_states.rest
+        lmbda discount epsilon momentum terminations.initial initial_states.rest
         initial_states.motions beginnings_in_motion
     """,
     FLAG: """

@@ -51,7 +51,7 @@ KNOWN = frozenset(
             ),
             "methods.options": ("SeparateOptions", "Terminations"),
             "methods.scratch": ("gaussian_actor", "gaussian_parts"),
-            "methods.transforms": ("ClipAsOption", "CorrelatedNoise", "OptionMemory"),
+            "methods.transforms": ("ClipAsOption", "OptionMemory"),
             "modules": (
                 *("GaussianPolicy", "Gating", "GoalEncoder", "InjectedPolicy", "JointGating", "Primitives"),
                 "StateGoalEncoder",

@@ -8,7 +8,7 @@ from torchrl_mcp.envs.transfer import task_reward
 
 
 class EpisodeStatistics:
-    """Returns and lengths of episodes that span several batches, from the task's own rewards without shaping.
+    """Returns and lengths of episodes that span several batches, from the task's own rewards.
 
     Args:
         num_envs: Number of environments, ``N``.

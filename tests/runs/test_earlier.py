@@ -1,0 +1,35 @@
+"""Runs of earlier versions: their policies can be evaluated, and what cannot be trained further says so."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from torchrl_mcp.runs import experiment, policies
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.earlier import require_resumable, translated
+from torchrl_mcp.training import checkpoint
+
+
+def test_what_this_version_lacks_is_left_out_at_any_depth():
+    held = {"task": {"pretrain": {"failure_weighting": 0.5, "max_error": 0.3}}, "list": [{"shaping": {}}], "seed": 1}
+    assert translated(held) == {"task": {"pretrain": {"max_error": 0.3}}, "list": [{}], "seed": 1}
+
+
+def test_a_published_network_that_was_trained_with_what_is_removed_can_be_restored():
+    file = builtin("mcp", "biped")
+    assert checkpoint.saved_config(file)["task"]["pretrain"]["failure_weighting"] == 0.5
+    cfg, agent, env = policies.restore(file, num_envs=2, seed=0)
+    assert "failure_weighting" not in cfg.task.pretrain
+    assert agent.actor.policy(env.reset())["action"].shape == (2, env.action_spec.shape[-1])
+
+
+@pytest.mark.parametrize("setting", [{"failure_weighting": 0.5}, {"shaping": {"object": {"slope": 1.0}}}])
+def test_a_run_that_was_trained_with_what_is_removed_cannot_be_resumed(setting, tmp_path, monkeypatch):
+    config = {"stage": {"name": "pretrain"}, "task": {"pretrain": setting}}
+    with pytest.raises(ValueError, match=rf"trained with {next(iter(setting))}=.*: resume it with the version"):
+        require_resumable(config)
+    unused = {"stage": {"name": "pretrain"}, "task": {"pretrain": {"failure_weighting": 0.0, "shaping": {}}}}
+    require_resumable(unused)
+    monkeypatch.setattr(experiment, "is_complete", lambda folder: False)
+    OmegaConf.save(config, tmp_path / "config.yaml")
+    with pytest.raises(ValueError, match="which this version lacks"):
+        experiment.resume(tmp_path)
