@@ -70,8 +70,8 @@ def test_an_optimiser_without_a_schedule_has_none_with_any_preset(preset):
     assert cfg.optimizer.actor._target_ == "torch.optim.SGD"
 
 
-def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
-    cfg = composed("task=heading", "task.name=juggle")
+def test_a_task_that_has_no_settings_of_its_own_takes_the_defaults():
+    cfg = composed("task=heading", "method=scratch")
     assert dict(cfg.training) == {
         "num_envs": 128,
         "frames_per_batch": 4096,
@@ -84,6 +84,37 @@ def test_the_fast_preset_has_numbers_for_tasks_that_it_does_not_know():
     imitation = composed("task=imitation")
     assert (imitation.training.total_frames, imitation.optimizer.schedule.target_kl) == (10_000_000, 0.05)
     assert (composed().training.num_envs, composed().training.minibatch_size) == (64, 512)
+
+
+TUNED = sorted(path.relative_to(CONF / "tuned").with_suffix("").parts for path in (CONF / "tuned").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize(("task", "method"), TUNED)
+def test_tuned_settings_are_of_a_task_and_a_method_and_none_of_them_enters_the_paper_s(task, method):
+    assert task in TASKS
+    assert method in METHODS
+    stage = "pretrain" if task == "imitation" else "transfer"
+    place = (f"task={task}", f"method={method}", f"stage={stage}")
+    assert composed(*place) != composed(*place, "~tuned")
+    # Adam's, which the paper did not use, may differ.
+    papers = [composed(*place, "preset=paper", *without) for without in ([], ["~tuned"])]
+    for paper in papers:
+        del paper.step_size.max, paper.step_size.target_kl, paper.step_size.critic
+    assert OmegaConf.to_container(papers[0], resolve=True) == OmegaConf.to_container(papers[1], resolve=True)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_gates_over_products_explore_over_weights_unless_the_paper_s_settings_are_asked_for(method):
+    explored = {
+        (stage, preset): composed("task=holdout", f"method={method}", f"stage={stage}", f"preset={preset}").actor
+        for stage in STAGES
+        for preset in ("fast", "paper")
+    }
+    over_weights = {key for key, actor in explored.items() if actor._target_.endswith("weights_actor")}
+    assert over_weights == ({("transfer", "fast")} if method == "mcp" else set())
+    assert composed(f"method={method}", "stage=transfer").objective.loss.get("bound_coeff", 10.0) == (
+        0.0 if method == "mcp" else 10.0
+    )
 
 
 SHARED = ["observation_normaliser"]

@@ -103,7 +103,6 @@ def test_a_setting_like_no_other_is_answered_with_the_groups():
         ["+note=new"],
         ["~logger"],
         pytest.param(["method=scratch", "parts.policy.std=0.2"], id="a setting of another method"),
-        pytest.param(["preset=paper", "ppo.clip_epsilon=0.1"], id="a setting of another preset"),
     ],
 )
 def test_settings_that_exist_are_left_alone(arguments):

@@ -131,13 +131,6 @@ def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 11_000_000)
 
 
-def test_table_2_lets_mcp_alone_explore_over_weights_which_the_ants_gate_does_not():
-    rows = benchmark.expand(OmegaConf.to_container(OmegaConf.load(BENCHMARKS / "table2.yaml"))["rows"], {})
-    assert {(cell["method"], cell["task"]) for cell in rows if cell.get("exploration") == "weights"} == {
-        ("mcp", task) for task in ("heading", "dribble", "carry")
-    }
-
-
 def test_pretraining_ignores_how_much_the_gate_of_transfer_explores(tmp_path):
     arguments = ["task=heading", "character=biped", "method=mcp", "seed=0", "exploration=weights"]
     source, transfer = jobs_of(

@@ -31,7 +31,7 @@ Runs = Mapping[str, DictConfig]
 HEADING = ["task=heading", "character=humanoid"]
 RUNS = {
     "pretrain": ["method=mcp", "task=imitation", "character=humanoid", "stage=pretrain"],
-    "mcp": ["method=mcp", *HEADING, "stage=transfer", "exploration=weights"],
+    "mcp": ["method=mcp", *HEADING, "stage=transfer"],
     "scratch": ["method=scratch", *HEADING],
 }
 TITLES = {"pretrain": "primitives", "mcp": "MCP", "scratch": "scratch"}
@@ -259,7 +259,7 @@ def commands(folder: Path) -> dict[str, str]:
     train = "torchrl-mcp-train method=mcp task=heading character=humanoid stage=transfer pretrained=builtin"
     return {
         "steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"]),
-        "train a gate yourself": f"{train} exploration=weights run_dir=runs/gate",
+        "train a gate yourself": f"{train} run_dir=runs/gate",
         "pre-train the primitives yourself": "torchrl-mcp-demo --pretrain",
     }
 

@@ -166,7 +166,7 @@ def choices(run: Run) -> dict[str, Any]:
         "latent_dim": settings.get("latent_dim"),
         "trained": trained if transfers else None,
         "mixer": settings.get("mixer.name"),
-        "exploration": settings.get("exploration.name"),
+        "exploration": settings.get("exploration.name") if _explores(run) else None,
         "practice": settings.get("practice.name") if run.stage == "transfer" else None,
         "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
     }
@@ -257,8 +257,13 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
 def _learned(run: Run) -> dict[str, Any]:
     """Settings of a run that may affect learning."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
-    ignored = UNLEARNT | {other_stage}
+    ignored = UNLEARNT | {other_stage} | (set() if _explores(run) else {"exploration"})
     return {name: value for name, value in run.settings.items() if not is_among(name, ignored)}
+
+
+def _explores(run: Run) -> bool:
+    """Return whether the policy of a run is one of the group ``exploration``, which other methods do not use."""
+    return run.settings.get("actor._target_") == run.settings.get("exploration.actor._target_")
 
 
 def _varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -73,8 +73,8 @@ NAMES_BY_RULE: dict[Rule, str] = {
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
     SEED: "seed",
     POSITIVE: """
-        lr critic_lr min_lr max_lr target_kl clip_epsilon advantages.clip action_std initial_std std logits_std scale
-        speed max_error width kept_width
+        lr min_lr max_lr step_size.actor step_size.max step_size.critic target_kl clip_epsilon advantages.clip
+        action_std initial_std std logits_std scale speed max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
     PERIOD: "switch_interval",

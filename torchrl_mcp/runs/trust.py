@@ -8,6 +8,9 @@ import pkgutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
+from glob import glob
+from importlib.resources import files
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -24,50 +27,6 @@ DEEPEST = 100
 
 GET_CLASS = "hydra.utils.get_class"
 """Hydra's function that returns a class, for configurations that pass a class as an argument."""
-
-KNOWN = frozenset(
-    {
-        GET_CLASS,
-        *("torch.nn.Sigmoid", "torch.nn.Softmax", "torch.optim.Adam", "torch.optim.SGD"),
-        *("torchrl.objectives.ClipPPOLoss", "torchrl.objectives.KLAdaptiveLR", "torchrl.record.loggers.get_logger"),
-    }
-    | {
-        f"torchrl_mcp.{module}.{name}"
-        for module, names in {
-            "distributions": ("AdditiveGaussian", "MultiplicativeGaussian"),
-            "envs": ("Carry", "Dribble", "Heading", "Holdout", "Imitation"),
-            "envs.motions": ("generated_library", "turning_clips"),
-            "envs.motions.corpus": ("folder_library",),
-            "envs.motions.single": ("single_motion",),
-            "methods.critic": ("value_critic",),
-            "methods.finetune": ("injected_actor", "injected_parts"),
-            "methods.hierarchical": (
-                *("gated_actor", "gated_parts", "primitive_actor", "primitive_parts", "random_sequence"),
-            ),
-            "methods.latent_space": ("latent_actor", "latent_parts", "random_latents"),
-            "methods.mcp": ("composite_actor", "composite_parts", "random_weights", "weights_actor"),
-            "methods.option_critic": (
-                *("option_critic_actor", "option_critic_parts", "option_values", "random_sequence"),
-            ),
-            "methods.options": ("SeparateOptions", "Terminations"),
-            "methods.scratch": ("gaussian_actor", "gaussian_parts"),
-            "methods.transforms": ("ClipAsOption", "OptionMemory"),
-            "modules": (
-                *("GaussianPolicy", "Gating", "GoalEncoder", "InjectedPolicy", "JointGating", "Primitives"),
-                "StateGoalEncoder",
-            ),
-            "objectives": (
-                *("Advantages", "BoundedClipPPOLoss", "LatentPPOLoss", "OptionAdvantages", "OptionCriticLoss"),
-                *("MirroredSamples", "SymmetryLoss"),
-                *("OptionValueLoss", "SemiMarkovAdvantages", "ValueLoss"),
-            ),
-            "training.collectors": ("RemoteSource", "local"),
-            "viewer.recorder": ("Recorder",),
-        }.items()
-        for name in names
-    }
-)
-"""Classes and functions that the files of ``conf`` name."""
 
 _trusted: ContextVar[frozenset[str]] = ContextVar("trusted", default=frozenset())
 
@@ -99,6 +58,14 @@ def targets(config: Any) -> Iterator[str]:
         return
     for item in config.values() if isinstance(config, Mapping) else config:
         yield from targets(item)
+
+
+@cache
+def known() -> frozenset[str]:
+    """Return the classes and functions that the files of ``conf`` name."""
+    pattern = str(files("torchrl_mcp.conf").joinpath("**/*.yaml"))
+    texts = (Path(path).read_text() for path in glob(pattern, recursive=True))
+    return frozenset(name for text in texts for name in targets(yaml.safe_load(text)))
 
 
 def require_trusted(config: Mapping[str, Any], source: Path) -> None:
@@ -153,7 +120,7 @@ def _depth(text: str) -> int:
 def _may_be_built(name: str) -> bool:
     """Return whether a configuration from a file may contain a name. Only trusted modules are imported."""
     trusted = _trusted.get()
-    if name in KNOWN | trusted:
+    if name in known() | trusted:
         return True
     if not _is_in(name, trusted):
         return False
