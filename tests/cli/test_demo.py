@@ -66,6 +66,7 @@ def test_the_page_shows_only_what_is_there(finished):
     assert pictures[-1] == "learning_curves.svg"
     assert all((finished.folder / picture).is_file() for picture in pictures)
     assert re.findall(r"<tr><td>(\w+)</td>", page) == ["MCP", "scratch"]
+    assert len(re.findall(r"<pre>torchrl-mcp-", page)) == len(demo.commands(finished.folder))
 
 
 @pytest.mark.parametrize("name", ["mcp", "scratch"])

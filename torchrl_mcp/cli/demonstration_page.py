@@ -27,7 +27,7 @@ def write_page(
         caption: What the table compares.
         film: File of the film in ``folder``, or None without one.
         curves: File of the learning curves in ``folder``.
-        commands: Next commands, and what each does.
+        commands: Next commands, by what each does.
     """
     environment = Environment(loader=PackageLoader("torchrl_mcp.report"), autoescape=True, undefined=StrictUndefined)
     context = {"rows": rows, "caption": caption, "film": film, "curves": curves, "commands": commands}
