@@ -23,7 +23,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchrl_mcp.envs.transport import Transport
+from torchrl_mcp.envs import Carry, Dribble
 from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.builtin import locate
 
@@ -41,7 +41,7 @@ class SteeredPolicy(TensorDictModuleBase):
 
     in_keys, out_keys = ("observation", "goal"), ("action",)
 
-    def __init__(self, env: Transport, heading: TensorDictModuleBase, turn: float) -> None:
+    def __init__(self, env: Carry | Dribble, heading: TensorDictModuleBase, turn: float) -> None:
         super().__init__()
         self.env, self.turn, self._heading = env, turn, [heading]
 

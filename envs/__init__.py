@@ -9,6 +9,7 @@ if __name__ != "torchrl_mcp.envs":
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.carry import Carry
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.dribble import Dribble
 from torchrl_mcp.envs.gymnasium_env import register, register_holdout, register_imitation
 from torchrl_mcp.envs.heading import Heading
@@ -17,7 +18,7 @@ from torchrl_mcp.envs.imitation import Imitation
 from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 
-__all__ = ["Carry", "CharacterEnv", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
+__all__ = ["Carry", "CharacterEnv", "Curriculum", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
 
 register([Heading, Carry, Dribble], CHARACTERS)
 register_holdout(Holdout)

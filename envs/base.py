@@ -1,7 +1,8 @@
-"""The base class of all environments."""
+"""The base class of all environments: what happens in a step, in the order of :meth:`CharacterEnv._step`."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -24,9 +25,11 @@ ALL = slice(None)
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
-    A task defines observations, rewards, terminations and initial states in the methods at the end of this class. The
+    A task defines :meth:`initial_state`, :meth:`observe` and :meth:`reward`, and where it needs them
+    :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal` and :meth:`normalised_return`. This
     class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. The state of a task
-    beyond the physics (a goal, a position before the step) is kept in ``episode``, which snapshots include.
+    beyond the physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
+    :meth:`make_specs`.
 
     A simulation that diverges or gets a non-finite action ends only its own episode: it is ``terminated``, with reward
     0 and the observation from before the step, and ``num_diverged`` counts it.
@@ -36,7 +39,7 @@ class CharacterEnv(EnvBase):
         num_envs: Number N of simulations.
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
-        episode: Initial task state of one simulation, by name; stored as ``(N, ...)``.
+        episode: Task state of one simulation at the beginning of an episode, by name; stored as ``(N, ...)``.
         outputs: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         model_fields: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
         physics: The engine: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
@@ -63,7 +66,7 @@ class CharacterEnv(EnvBase):
         *,
         substeps: int,
         max_episode_steps: int,
-        episode: Mapping[str, Tensor],
+        episode: Mapping[str, Tensor] = MappingProxyType({}),
         outputs: Sequence[str] = (),
         model_fields: Sequence[str] = (),
         physics: str = "mujoco",
@@ -100,10 +103,10 @@ class CharacterEnv(EnvBase):
             persistent=persistent,
             current=current,
         )
-        episode = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
-        self.episode = {
-            key: value.to(self.device).repeat(num_envs, *[1] * value.ndim) for key, value in episode.items()
-        }
+        blank = {"elapsed_steps": torch.zeros(1, dtype=torch.int64), **episode}
+        self._blank = {key: value.to(self.device) for key, value in blank.items()}
+        self.episode = {key: value.repeat(num_envs, *[1] * value.ndim) for key, value in self._blank.items()}
+        self._tracked: dict[str, Tensor] = {}
         self.num_diverged = 0
         self._everybody = torch.arange(num_envs).to(self.device)
         self._snapshot: TensorDict | None = None
@@ -130,6 +133,14 @@ class CharacterEnv(EnvBase):
             f"{type(self).__name__} has no mirror image, which symmetry needs: pass symmetry=none, or a task of biped, "
             "humanoid or T-Rex"
         )
+
+    def normalised_return(self, episode_return: Tensor) -> Tensor:
+        r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
+
+        :math:`R` is the undiscounted return and :math:`T` ``max_episode_steps``, for rewards from 0 to 1. The paper's
+        normalisation is not documented.
+        """
+        return episode_return / self.max_episode_steps
 
     def reach(self) -> Reach | None:
         """Returns of standing still and of an ideal player in the episodes just begun, None if the task has none."""
@@ -198,12 +209,12 @@ class CharacterEnv(EnvBase):
             self._camera[1].close()
             self._camera = None
 
-    def _make_specs(self) -> None:
+    def make_specs(self) -> None:
         """Derive the specs from the observation; a task calls this at the end of its constructor."""
         shape, one = self.batch_size, (self.num_envs, 1)
         bounds = self._action_bounds().to(self.device, self._dtype)
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
-        self._observed = {key: value.to(self._type(value), copy=True) for key, value in self._observe(ALL).items()}
+        self._observed = {key: value.to(self._type(value), copy=True) for key, value in self._observed_of(ALL).items()}
         observed = {key: self._spec(value) for key, value in self._observed.items()}
         self.observation_spec = Composite(observed, shape=shape, device=self.device)
         self.action_spec = Bounded(low, high, dtype=self._dtype, device=self.device)
@@ -250,11 +261,15 @@ class CharacterEnv(EnvBase):
             )
         diverged = self.simulation.step(self._controls(action))
         self.episode["elapsed_steps"] += 1
-        reward, terminated = self._reward_and_termination(diverged)
+        self.after_step(diverged)
+        reward, terminated = self._outcome(diverged)
         if len(diverged):
             reward[diverged], terminated[diverged] = 0.0, True
             self.num_diverged += len(diverged)
-        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._truncation()
+        for name, place in self._tracked.items():
+            self.episode[name].copy_(place)
+        self.update_goal()
+        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self.truncated().unsqueeze(-1)
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
@@ -269,9 +284,9 @@ class CharacterEnv(EnvBase):
         """Begin episodes in the simulations ``ids``; entries that ``state`` lacks are drawn."""
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
-            state = {**self._sample(len(ids)), **state}
+            state = {**self.initial_state(len(ids)), **state}
         self.simulation.reset(ids, {key: state[key] for key in self.simulation.state if key in state})
-        state = {"elapsed_steps": torch.zeros_like(self.episode["elapsed_steps"][ids]), **self._begin(ids), **state}
+        state = {**self._blank, **{name: place[ids] for name, place in self._tracked.items()}, **state}
         for key, memory in self.episode.items():
             memory[ids] = state[key].to(memory.dtype)
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
@@ -295,7 +310,7 @@ class CharacterEnv(EnvBase):
 
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
         """Output for all simulations, of which only ``ids`` have changed since the last output."""
-        for key, value in self._observe(ids).items():
+        for key, value in self._observed_of(ids).items():
             if isinstance(ids, slice):
                 self._observed[key].copy_(value)
             else:
@@ -315,20 +330,38 @@ class CharacterEnv(EnvBase):
         """Controls of the actuators, ``(N, A)``: by default the action."""
         return action
 
-    def _truncation(self) -> Tensor:
-        """Whether the task ends for a reason other than failure, which truncates the episode, ``(N, 1)``."""
-        return torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+    def _observed_of(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """Output of simulations before rewards and ends: by default what the task observes."""
+        return self.observe(ids)
+
+    def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+        """Reward of the step (float64) and whether it ended the episode, ``(N,)`` each."""
+        return self.reward(), self.terminated()
+
+    def track(self, **places: Tensor) -> None:
+        """Keep the values of live views from before each step in ``episode``, for :meth:`velocity`.
+
+        Args:
+            **places: Live views of positions in metres by name, each ``(N, D)``.
+        """
+        self._tracked |= places
+        self.episode |= {name: place.to(torch.float64, copy=True) for name, place in places.items()}
+
+    def velocity(self, name: str) -> Tensor:
+        """Mean velocity of a tracked place in the last step, in m/s, ``(N, D)``, float64."""
+        return (self._tracked[name] - self.episode[name]) / self.control_timestep
 
     @abstractmethod
-    def _sample(self, num: int) -> dict[str, Tensor]:
-        """Draw ``num`` initial states from ``generator``: ``qpos``, ``qvel``, and entries of ``episode``."""
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """Draw the states of ``num`` episodes at their beginning, with ``generator``.
+
+        Returns:
+            ``qpos``, ``qvel``, other state fields of the simulation, and entries of ``episode`` that differ from those
+            given to the constructor, each ``(num, ...)``.
+        """
 
     @abstractmethod
-    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
-        """The entries of ``episode`` that follow from the initial state, rows of the simulations ``ids``."""
-
-    @abstractmethod
-    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
 
         Args:
@@ -339,12 +372,26 @@ class CharacterEnv(EnvBase):
         """
 
     @abstractmethod
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        """Reward (float64) of the step just made and whether it ended the episode, ``(N,)`` each; updates ``episode``.
+    def reward(self) -> Tensor:
+        """Reward of the step just made, ``(N,)``, float64."""
+
+    def after_step(self, diverged: Tensor) -> None:
+        """Change what a step calls for, right after it: a weld that closes, say, or measurements in ``episode``.
 
         Args:
-            diverged: Simulations that did not move, shape ``(n,)``; their results are ignored.
+            diverged: Simulations that did not move, shape ``(n,)``; their rewards are ignored.
         """
+
+    def terminated(self) -> Tensor:
+        """Whether the step just made ended the episode, by failure or success, ``(N,)``: by default it did not."""
+        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def truncated(self) -> Tensor:
+        """Whether the episode is cut short for a reason other than the time limit, ``(N,)``: by default it is not."""
+        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def update_goal(self) -> None:
+        """Change the goal after the reward of a step, for the next action: a direction that wanders, say."""
 
     @property
     def metric_names(self) -> dict[str, list[str]]:

@@ -8,13 +8,15 @@ from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.initial_states import InitialStates
 from torchrl_mcp.envs.mirror import VECTOR_SIGNS, Mirror, mirror_signs
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.ranges import Ranges
 from torchrl_mcp.envs.rendering import Arrow
 from torchrl_mcp.envs.rewards import heading_reward
-from torchrl_mcp.envs.transfer import TransferTask
 
 
-class Heading(TransferTask):
+class Heading(PDCharacterEnv):
     r"""A character walks at a given speed in a direction that wanders.
 
     .. math:: \hat{\theta}_t = \hat{\theta}_{t-1} + \mathrm{Uniform}(-\delta, \delta)
@@ -30,7 +32,7 @@ class Heading(TransferTask):
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
             faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.transfer.TransferTask`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -62,23 +64,34 @@ class Heading(TransferTask):
         super().__init__(
             character,
             num_envs,
-            ranges={"initial_directions": initial_directions},
             max_episode_steps=max_episode_steps,
             episode={"direction": torch.zeros((), dtype=torch.float64)},
             **kwargs,
         )
-        self._make_specs()
+        self.initial_states = InitialStates(
+            character, self.curriculum.initial_states, self.curriculum.motions, self.device
+        )
+        self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
+        self.make_specs()
 
-    def normalised_return(self, episode_return: Tensor) -> Tensor:
-        r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The character, and a direction."""
+        direction = self.ranges.draw(num, self.generator)["initial_directions"]
+        return {**self.initial_states.fill(super().initial_state(num), self.generator), "direction": direction}
 
-        :math:`R` is the undiscounted return and :math:`T` ``max_episode_steps``: a reward is at most 1. The paper's
-        normalisation is not documented.
-        """
-        return episode_return / self.max_episode_steps
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """State of the character, and the target direction as it sees it."""
+        goal = unit_vector(self.episode["direction"][ids] - self.heading(ids))
+        return {"observation": self.see(ids)[0], "goal": goal}
 
-    def _goal_mirror(self) -> Mirror:
-        return mirror_signs(VECTOR_SIGNS)
+    def reward(self) -> Tensor:
+        """Reward of appendix D."""
+        return heading_reward(self.velocity("com")[:, :2], unit_vector(self.episode["direction"]), self.speed)
+
+    def update_goal(self) -> None:
+        """Let the direction wander."""
+        direction = self.episode["direction"]
+        direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
 
     def reach(self) -> Reach:
         """See :meth:`CharacterEnv.reach`: the ideal player walks at the target speed from the first step on."""
@@ -86,23 +99,13 @@ class Heading(TransferTask):
         standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
         return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))
 
-    def _sample(self, num: int) -> dict[str, Tensor]:
-        drawn = self.ranges.draw(num, self.generator)
-        return {**super()._sample(num), "direction": drawn["initial_directions"]}
-
-    def _show(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        angle = self.heading(ids)
-        return {"observation": self._state(ids, angle), "goal": unit_vector(self.episode["direction"][ids] - angle)}
-
-    def _rewards(self) -> Tensor:
-        direction = self.episode["direction"]
-        reward = heading_reward(self._com_velocity(), unit_vector(direction), self.speed)
-        direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
-        return reward.unsqueeze(0)
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
+        return mirror_signs(VECTOR_SIGNS)
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
-        tail = self._com[index].cpu() + torch.tensor([0.0, 0.0, 0.8])
+        tail = self.com[index].cpu() + torch.tensor([0.0, 0.0, 0.8])
         tip = tail + torch.nn.functional.pad(unit_vector(self.episode["direction"][index].cpu()), (0, 1))
         return [(tail.double().numpy(), tip.numpy())]
 

@@ -90,7 +90,7 @@ class Holdout(CharacterEnv):
             reset_noise_scale=reset_noise_scale,
         )
         model = ant().compile()
-        episode = {"goal": torch.zeros(2, dtype=dtype), "position": torch.zeros(2, dtype=torch.float64)}
+        episode = {"goal": torch.zeros(2, dtype=dtype)}
         if contact_forces:
             episode["contact_forces"] = torch.zeros(model.nbody, 6, dtype=torch.float64)
         super().__init__(
@@ -106,7 +106,7 @@ class Holdout(CharacterEnv):
         )
         self.directions, self.reset_noise_scale = directions, reset_noise_scale
         self.healthy_z_range, self.terminate_when_unhealthy = healthy_z_range, terminate_when_unhealthy
-        self._reward = partial(
+        self._reward_of = partial(
             holdout_reward,
             forward_weight=forward_weight,
             healthy_weight=healthy_weight,
@@ -117,8 +117,8 @@ class Holdout(CharacterEnv):
         self._rest = torch.from_numpy(model.qpos0).to(self.device)
         qpos, self._qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
         self._height, self._posture = qpos[:, 2], qpos[:, 2:]
-        self._torso = self.simulation.outputs["xpos"][:, TORSO, :2]
-        self._make_specs()
+        self.track(position=self.simulation.outputs["xpos"][:, TORSO, :2])
+        self.make_specs()
 
     @classmethod
     def characters(cls) -> tuple[str, ...]:
@@ -145,10 +145,11 @@ class Holdout(CharacterEnv):
         """See :meth:`CharacterEnv.reach`: the ideal is Gymnasium's threshold for solved, which can be exceeded."""
         still = torch.zeros(self.num_envs, 2, device=self.device)
         action, healthy = torch.zeros_like(self.simulation.state["ctrl"]), torch.ones_like(still[:, 0])
-        standing = self.max_episode_steps * self._reward(still, self.episode["goal"], action, healthy)
+        standing = self.max_episode_steps * self._reward_of(still, self.episode["goal"], action, healthy)
         return Reach(standing, torch.full_like(standing, self._solved()))
 
-    def _sample(self, num: int) -> dict[str, Tensor]:
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The ant near its rest pose, and a direction."""
         model, noise, source = self.simulation.model, self.reset_noise_scale, self.generator
         blank = partial(torch.empty, dtype=torch.float64, device=self.device)
         angle = blank(num, 1).uniform_(*self.directions, generator=source)
@@ -159,30 +160,34 @@ class Holdout(CharacterEnv):
             "qvel": blank(num, model.nv).normal_(0.0, noise, generator=source),
         }
 
-    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
-        begun = {"position": self._torso[ids]}
+    def after_step(self, diverged: Tensor) -> None:
+        """Measure the contact forces, if they are observed; a simulation that did not move keeps its own."""
         if "contact_forces" in self.episode:
-            begun["contact_forces"] = torch.zeros_like(self.episode["contact_forces"][ids])
-        return begun
+            forces = self.simulation.contact_forces().clamp(*CONTACT_FORCE_RANGE)
+            forces[diverged] = self.episode["contact_forces"][diverged]
+            self.episode["contact_forces"].copy_(forces)
 
-    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """Gymnasium's observation, and the direction."""
         parts = [self._posture[ids], self._qvel[ids]]
         if "contact_forces" in self.episode:
             parts.append(self.episode["contact_forces"][ids, 1:].flatten(1))  # Ant-v5 leaves the world body out
         return {"observation": torch.cat(parts, -1), "goal": self.episode["goal"][ids]}
 
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        velocity = (self._torso - self.episode["position"]) / self.control_timestep
-        self.episode["position"].copy_(self._torso)
-        healthy = self._height == self._height.clamp(*self.healthy_z_range)
-        contacts = None
-        if "contact_forces" in self.episode:
-            forces = self.simulation.contact_forces().clamp(*CONTACT_FORCE_RANGE)
-            forces[diverged] = self.episode["contact_forces"][diverged]
-            contacts = self.episode["contact_forces"].copy_(forces).flatten(1)
+    def reward(self) -> Tensor:
+        """Reward of appendix D."""
+        contacts = self.episode.get("contact_forces")
+        forces = None if contacts is None else contacts.flatten(1)
         action = self.simulation.state["ctrl"]
-        reward = self._reward(velocity, self.episode["goal"], action, healthy, contacts)
-        return reward, ~healthy if self.terminate_when_unhealthy else torch.zeros_like(healthy)
+        return self._reward_of(self.velocity("position"), self.episode["goal"], action, self.healthy(), forces)
+
+    def terminated(self) -> Tensor:
+        """Whether the ant is unhealthy."""
+        return ~self.healthy() & self.terminate_when_unhealthy
+
+    def healthy(self) -> Tensor:
+        """Whether the torso is at a healthy height, shape ``(N,)``, bool."""
+        return self._height == self._height.clamp(*self.healthy_z_range)
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""

@@ -36,6 +36,7 @@ def transport_reach(
     speed: float,
     timestep: float,
     num_steps: int,
+    success_distance: float = 0.0,
 ) -> Reach:
     """Returns of a player that goes straight to an object, takes it straight to its target, and then waits.
 
@@ -48,15 +49,21 @@ def transport_reach(
         speed: Speed of player and object, in m/s.
         timestep: Duration of a step in seconds.
         num_steps: Steps of the episode.
+        success_distance: Metres between object and target below which the reward is 1; 0 for none.
     """
+
+    def reward_of(*state: Tensor) -> Tensor:
+        left = torch.linalg.vector_norm(state[2] - state[4], dim=-1)
+        return reward(*state).masked_fill(left < success_distance, 1.0)
+
     still, stride = torch.zeros_like(com), speed * timestep
-    standing = num_steps * reward(com, still, position, still, target)
+    standing = num_steps * reward_of(com, still, position, still, target)
     ideal = torch.zeros_like(standing)
     for _ in range(num_steps):
         at_hand = torch.linalg.vector_norm(position - com, dim=-1, keepdim=True) < CLOSE + 1e-6
         moved = torch.where(at_hand, _towards(position, target, stride), position)
         walked = _towards(com, moved, stride, stop=CLOSE)
-        ideal += reward(walked, (walked - com) / timestep, moved, (moved - position) / timestep, target)
+        ideal += reward_of(walked, (walked - com) / timestep, moved, (moved - position) / timestep, target)
         com, position = walked, moved
     return Reach(standing, ideal)
 

@@ -138,7 +138,7 @@ class Imitation(PDCharacterEnv):
         model, own = self.simulation.model, slice(1, 1 + len(self._bodies))
         masses, centres = (torch.from_numpy(field[own]) for field in (model.body_mass, model.body_ipos))
         self._masses, self._centres_of_mass = masses.to(self.device), centres.to(self.device)
-        self._make_specs()
+        self.make_specs()
         for name in self.terms:
             self._error(name, self._next)
 
@@ -188,7 +188,8 @@ class Imitation(PDCharacterEnv):
             )
         super().set_extra_state(state)
 
-    def _sample(self, num: int) -> dict[str, Tensor]:
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The state of the reference at random moments."""
         return self.beginning(*self._draw(num))
 
     def _draw(self, num: int, clips: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -198,10 +199,12 @@ class Imitation(PDCharacterEnv):
             return clips, shares * self.library.durations[clips]
         return self.library.sample(num, self.generator)
 
-    def _goal_mirror(self) -> Mirror:
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
         return mirror_bodies(self._bodies, repeats=NUM_TARGETS)
 
-    def _observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """State of the character, and the next states of the reference as the character sees them."""
         angle, place = self.heading(ids), self._positions[ids, 0]
         targets = self._look_ahead(ids)
         placement = cast("Placement", targets.placement)
@@ -212,7 +215,7 @@ class Imitation(PDCharacterEnv):
         dtype = targets.moment.qpos.dtype
         goal = bodies_in_heading_frame(turn.to(dtype), origin.to(dtype), targets.moment.bodies)
         return {
-            "observation": self._state(ids, angle),
+            "observation": self.see(ids)[0],
             "goal": goal.unflatten(0, (NUM_TARGETS, -1)).transpose(0, 1).flatten(1),
             "tracking_error": self.episode["error"][ids].unsqueeze(-1),
             "reward_terms": self.episode["terms"][ids],
@@ -228,15 +231,30 @@ class Imitation(PDCharacterEnv):
         self._next = first if isinstance(ids, slice) else self._next.replaced(ids, first)
         return targets
 
-    def _reward_and_termination(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        self.episode["time"] += CONTROL_TIMESTEP
+    def after_step(self, diverged: Tensor) -> None:
+        """Measure the distance from the reference, and the terms of the reward."""
         reference = self._next
-        error = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1).mean(-1)
-        lost = self.episode["error"].copy_(error) > self.max_error
-        rewards = imitation_rewards({name: self._error(name, reference) for name in self.terms}, self.terms)
-        reward, fallen = self._unless_fallen(self.episode["terms"].copy_(rewards).sum(-1))
+        distances = torch.linalg.vector_norm(self._positions - reference.positions, dim=-1)
+        self.episode["error"].copy_(distances.mean(-1))
+        errors = {name: self._error(name, reference) for name in self.terms}
+        self.episode["terms"].copy_(imitation_rewards(errors, self.terms))
+
+    def reward(self) -> Tensor:
+        """Sum of the terms, or 0 where the reference is lost."""
+        return self.episode["terms"].sum(-1).masked_fill(self.terminated(), 0.0)
+
+    def terminated(self) -> Tensor:
+        """Whether the bodies are too far from the reference."""
+        return self.episode["error"] > self.max_error
+
+    def update_goal(self) -> None:
+        """Let the reference go on, and change some of them."""
+        self.episode["time"] += CONTROL_TIMESTEP
         self._switch()
-        return reward.masked_fill(lost, 0.0), fallen | lost
+
+    def truncated(self) -> Tensor:
+        """Whether the clip has ended, unless another reference follows."""
+        return self._ended() & (self.clip_end == "truncate")
 
     def _switch(self) -> None:
         """Change the references of some simulations to a similar moment, at the character's position and heading."""
@@ -281,7 +299,7 @@ class Imitation(PDCharacterEnv):
             case "orientations":
                 return squared_angles(self._orientations, reference.orientations).mean(-1)
             case "com":
-                return squared_distances(self._com, self._centre_of_mass(reference))
+                return squared_distances(self.com, self._centre_of_mass(reference))
             case _:
                 raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
 
@@ -289,9 +307,6 @@ class Imitation(PDCharacterEnv):
         """Centre of mass of the character with its bodies at the reference, ``(N, 3)``."""
         places = reference.positions + rotate(reference.orientations, self._centres_of_mass)
         return self._masses @ places / self._masses.sum()
-
-    def _truncation(self) -> Tensor:
-        return (self._ended() & (self.clip_end == "truncate")).unsqueeze(-1)
 
     def _ended(self) -> Tensor:
         """Whether clips end before the last target of the next goal, ``(N,)``."""

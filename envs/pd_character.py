@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_mcp.envs.arrays import as_array, as_tensor
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.mirror import Mirror, mirror_actions, mirror_state
 from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import character_state, state_layout
@@ -19,6 +22,9 @@ from torchrl_mcp.envs.rotations import heading
 
 CONTROL_TIMESTEP = 1 / 30
 """Seconds per action."""
+
+TASK_REWARD = "task_reward"
+"""Key of the task's own reward in environments that train with another."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
@@ -31,17 +37,20 @@ class PDCharacterEnv(CharacterEnv):
     ``action``, in [-1, 1], scales to the targets of the PD controllers: exponential maps for ball joints and angles for
     hinges. Zero is the rest pose, standing upright; 1 is half the width of the target's range, to which the target is
     clipped. ``observation`` is :func:`~torchrl_mcp.envs.observations.character_state`; ``observation_layout`` has the
-    names of its entries.
+    names of its entries. ``com`` (N, 3) is the centre of mass, a live view, and ``velocity("com")`` its velocity.
 
     The character *falls* when any body but its feet touches the ground. That ends the episode; the reward of the fall
-    is 0.
+    is 0, whatever :meth:`reward` returns. Episodes begin at rest. A ``curriculum`` changes training; if it has
+    ``reward_weights``, the reward is :meth:`training_reward`.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
-        episode: Initial task state of one simulation, in addition to ``com``, the centre of mass.
-        furnish: Function that adds the task's bodies to the scene, after character, ground and light.
+        episode: Task state of one simulation at the beginning of an episode.
+        furnish: Function that adds the task's objects to the scene, after character, ground and light.
+        curriculum: How training differs from the task, a :class:`~torchrl_mcp.envs.curriculum.Curriculum` or its
+            arguments by name; None for the task itself.
         physics_timestep: Seconds, a whole fraction of 1/30; None is the character's own choice.
         self_collision: Let bodies of the character collide with one another.
         friction_cone: MuJoCo's cone of contact forces, ``"pyramidal"`` or ``"elliptic"``. A pyramid has edges along the
@@ -54,13 +63,17 @@ class PDCharacterEnv(CharacterEnv):
         ValueError: If an argument is out of range.
     """
 
+    num_reward_terms = 0
+    """Number of terms of the task's reward that ``reward_weights`` of a curriculum may weigh."""
+
     def __init__(
         self,
         character: str,
         num_envs: int,
         *,
         max_episode_steps: int,
-        episode: Mapping[str, Tensor],
+        episode: Mapping[str, Tensor] = MappingProxyType({}),
+        curriculum: Curriculum | Mapping[str, Any] | None = None,
         furnish: Callable[[mujoco.MjSpec], None] = lambda spec: None,
         physics_timestep: float | None = None,
         self_collision: bool = False,
@@ -70,7 +83,13 @@ class PDCharacterEnv(CharacterEnv):
     ) -> None:
         if character not in CHARACTERS:
             raise ValueError(f"character={character!r} is unknown: pass one of {', '.join(CHARACTERS)}")
-        self.character = CHARACTERS[character]
+        self.character, self.curriculum = CHARACTERS[character], Curriculum.of(curriculum)
+        weights = self.curriculum.reward_weights
+        if weights is not None and len(weights) != self.num_reward_terms:
+            raise ValueError(
+                f"reward_weights={list(weights)}: {type(self).__name__} has {self.num_reward_terms} terms to weigh, "
+                "pass as many numbers, or None"
+            )
         spec = self.character.spec(self_collision=self_collision)
         self._bodies = [body.name for body in spec.bodies[1:]]
         if friction_cone not in CONES:
@@ -92,7 +111,7 @@ class PDCharacterEnv(CharacterEnv):
             num_envs,
             substeps=substeps,
             max_episode_steps=max_episode_steps,
-            episode={"com": torch.zeros(3, dtype=torch.float64), **episode},
+            episode=episode if weights is None else {TASK_REWARD: torch.zeros((), dtype=torch.float64), **episode},
             outputs=["xpos", "xquat", "cvel", "subtree_com", "geom_xpos", "geom_xmat"],
             persistent=True,
             current=True,
@@ -105,17 +124,20 @@ class PDCharacterEnv(CharacterEnv):
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
         """Slices of ``observation`` by name."""
-        # Live views, made once. The character's bodies follow the world, which is body 0.
-        bodies, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
-        self._positions, self._orientations = outputs["xpos"][:, bodies], outputs["xquat"][:, bodies]
-        self._com = outputs["subtree_com"][:, 1]
+        # Live views, made once. Body 0 is the world; the character's bodies come next, and then the task's objects.
+        own, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
+        self._positions, self._orientations = outputs["xpos"][:, own], outputs["xquat"][:, own]
+        self.com = outputs["subtree_com"][:, 1]
+        self.track(com=self.com)
         self._geom_heights = as_array(outputs["geom_xpos"])[..., 2]
         # Columns by component index are several times as fast as rows of matrices.
         self._geom_axes = as_array(outputs["geom_xmat"]).reshape(num_envs, -1)
         axes = torch.tensor([[6], [7], [8]])
         self._vertical_columns = as_array((9 * shapes[0] + axes).flatten().to(self.device))
         self._array_type = torch.empty(0, dtype=self._dtype).numpy().dtype
-        self._look_at(bodies)
+        self._seen = [as_array(outputs[key])[:, 1:] for key in ("xpos", "xquat", "cvel")]
+        trees = torch.from_numpy(model.body_rootid[1:]).to(self.device)
+        self._centres = as_array(outputs["subtree_com"]), as_array(trees if len(trees.unique()) > 1 else trees[:1])
 
     @classmethod
     def characters(cls) -> tuple[str, ...]:
@@ -126,12 +148,12 @@ class PDCharacterEnv(CharacterEnv):
         """See :meth:`CharacterEnv.mirrors`."""
         return {
             "observation": mirror_state(self._bodies),
-            "goal": self._goal_mirror(),
+            "goal": self.goal_mirror(),
             "action": mirror_actions(self.simulation.model),
         }
 
-    def _goal_mirror(self) -> Mirror:
-        """Return the reflection of ``goal``."""
+    def goal_mirror(self) -> Mirror:
+        """Return the reflection of ``goal`` that exchanges left and right, for :meth:`mirrors`."""
         return super().mirrors()["goal"]
 
     def heading(self, ids: Tensor | slice = ALL) -> Tensor:
@@ -144,31 +166,54 @@ class PDCharacterEnv(CharacterEnv):
         vertical = self._geom_axes[:, self._vertical_columns].reshape(len(heights), 3, -1).swapaxes(1, 2)
         return as_tensor((lowest_points(heights, vertical, half_sizes, radii) < 0).any(-1))
 
-    def _com_velocity(self) -> Tensor:
-        """Mean horizontal velocity of the centre of mass in the last step, ``(N, 2)``, in m/s."""
-        velocity = (self._com - self.episode["com"])[:, :2] / self.control_timestep
-        self.episode["com"].copy_(self._com)
-        return velocity
+    def pose(self, body: str) -> tuple[Tensor, Tensor]:
+        """Position ``(N, 3)`` and orientation ``(N, 4)`` of a body of the scene, by its name, as live views."""
+        index, outputs = self.simulation.model.body(body).id, self.simulation.outputs
+        return outputs["xpos"][:, index], outputs["xquat"][:, index]
 
-    def _unless_fallen(self, reward: Tensor) -> tuple[Tensor, Tensor]:
-        """Rewards ``(*R, N)``, or 0 after a fall, and whether the fall ends the episode, ``(N,)``."""
+    def see(self, ids: Tensor | slice) -> tuple[Tensor, Tensor]:
+        """State s of characters, and the objects around them.
+
+        Args:
+            ids: The simulations, as indices ``(n,)`` or the slice of all.
+
+        Returns:
+            The state ``(n, S)``, and for each of M objects, in the order of the scene, position relative to the root,
+            orientation, linear and angular velocity in the character's heading frame, ``(n, M, 13)``.
+        """
+        seen = character_state(self.heading(ids).to(self._dtype), self._body_states(ids))
+        own = 1 + 13 * len(self._bodies)
+        return seen[:, :own], seen[:, own:].unflatten(-1, (-1, 13))
+
+    def training_reward(self) -> Tensor:
+        """Reward of the last step with the curriculum's ``reward_weights``, ``(N,)``, float64."""
+        raise NotImplementedError
+
+    def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
+        """Reward and end of the step: a fall earns nothing, and ends the episode unless told otherwise."""
         fallen = self.fallen()
-        return reward.masked_fill(fallen, 0.0), fallen & self.terminate_on_fall
+        reward, terminated = (
+            self.reward().masked_fill(fallen, 0.0),
+            self.terminated() | (fallen & self.terminate_on_fall),
+        )
+        if self.curriculum.reward_weights is None:
+            return reward, terminated
+        self.episode[TASK_REWARD].copy_(reward)[diverged] = 0.0
+        return self.training_reward().masked_fill(fallen, 0.0), terminated
 
-    def _look_at(self, bodies: slice) -> None:
-        """Set the observed bodies: one tree, or several trees."""
-        outputs = {key: as_array(value) for key, value in self.simulation.outputs.items()}
-        self._bodies_seen = [outputs[key][:, bodies] for key in ("xpos", "xquat", "cvel")]
-        trees = torch.from_numpy(self.simulation.model.body_rootid[bodies]).to(self.device)
-        self._centres = outputs["subtree_com"], as_array(trees if len(trees.unique()) > 1 else trees[:1])
+    def _observed_of(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        observed = self.observe(ids)
+        if TASK_REWARD in self.episode:
+            observed[TASK_REWARD] = self.episode[TASK_REWARD][ids].unsqueeze(-1)
+        return observed
 
     def _body_states(self, ids: Tensor | slice) -> BodyStates:
-        """States of the observed bodies in the world, in ``dtype``; stored by component, for speed."""
+        """States of all bodies in the world, in ``dtype``; stored by component, for speed."""
         rows = ids if isinstance(ids, slice) else as_array(ids)
         centres, trees = self._centres
         if self.device.type != "cpu":
-            return body_states([part[rows] for part in self._bodies_seen], centres[rows][:, trees], self._dtype)
-        positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._bodies_seen)
+            return body_states([part[rows] for part in self._seen], centres[rows][:, trees], self._dtype)
+        positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._seen)
         arms = np.subtract(positions, centres[rows][:, trees].transpose(1, 2, 0), order="C")
         angular, linear = np.ascontiguousarray(twists[:, :3]), twists[:, 3:]
         # MuJoCo's cvel is the velocity of each body at the point of the centre of mass of its tree.
@@ -176,22 +221,19 @@ class PDCharacterEnv(CharacterEnv):
         parts = (positions, orientations, across + linear, angular)
         return BodyStates(*(torch.from_numpy(part.astype(self._array_type, "C")).permute(2, 0, 1) for part in parts))
 
-    def _state(self, ids: Tensor | slice, angle: Tensor) -> Tensor:
-        """State s of characters, whose roots have the heading ``angle``, ``(n, S)``."""
-        return character_state(angle.to(self._dtype), self._body_states(ids))
-
     def _action_bounds(self) -> Tensor:
         return torch.tensor([-1.0, 1.0]).expand(self.simulation.model.nu, 2)
 
     def _controls(self, action: Tensor) -> Tensor:
         return action * self._scale
 
-    def _sample(self, num: int) -> dict[str, Tensor]:
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """Return the scene at rest, with the first episodes shortened if the curriculum says so."""
         qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
-        return {"qpos": self._rest.repeat(num, 1), "qvel": qvel}
-
-    def _begin(self, ids: Tensor) -> dict[str, Tensor]:
-        return {"com": self._com[ids]}
+        start = {"qpos": self._rest.repeat(num, 1), "qvel": qvel}
+        if self.curriculum.random_first_length and num == self.num_envs:
+            start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
+        return start
 
 
 def body_states(parts: Sequence[Tensor], centres: Tensor, dtype: torch.dtype) -> BodyStates:
@@ -283,3 +325,12 @@ def lowest_points(heights: Numbers, vertical: Numbers, half_sizes: Numbers, radi
         Heights, shape ``(*B, G)``, in metres.
     """
     return heights - radii - (abs(vertical) * half_sizes).sum(-1)
+
+
+def task_reward(outcome: TensorDictBase) -> Tensor:
+    """The task's own reward of steps, also if training uses another, ``(*B, 1)``.
+
+    Args:
+        outcome: Output of an environment's steps, batch size ``(*B,)``.
+    """
+    return outcome.get(TASK_REWARD, outcome["reward"])

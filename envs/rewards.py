@@ -144,6 +144,35 @@ def idle_reward(weights: Sequence[float], speed: float) -> float:
     return weights[0] * math.exp(-1.5 * speed**2) + weights[2] * math.exp(-(speed**2))
 
 
+def reward_until_success(
+    reward: Tensor, success: Tensor, *, weights: Sequence[float], speed: float, discount: float
+) -> Tensor:
+    r"""Reward for training to carry and dribble: about zero for standing still, and greatest for a success.
+
+    .. math::
+        r' = \begin{cases}
+            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success, which ends the episode} \\
+            r - r_{idle} & \text{else}
+        \end{cases}
+
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success is
+    worth the discounted return of all terms being 1 for ever: otherwise a character that walks on knocks the box off
+    the target, and a success is worth little.
+
+    Args:
+        reward: :func:`transport_reward` with these weights, shape ``(*B)``.
+        success: Whether the object is at its target, shape ``(*B)``, bool.
+        weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
+        speed: Target speed :math:`\hat{v}`, in m/s, for the :func:`idle_reward`.
+        discount: Discount factor :math:`\gamma` of the learner, below 1.
+
+    Returns:
+        Reward, shape ``(*B)``.
+    """
+    idle = idle_reward(weights, speed)
+    return (reward - idle).masked_fill(success, (sum(weights) - idle) / (1 - discount))
+
+
 carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)
 """:func:`transport_reward` with the constants of the carry task."""
 

@@ -136,11 +136,10 @@ def test_transfer_keeps_and_freezes_what_the_paper_says(method):
 
 
 ANYWHERE = [-3.141592653589793, 3.141592653589793]
-PLAIN = {"initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": [], "staggered": False}
+PLAIN = {"curriculum": None}
 PLAIN |= {"terminate_on_fall": True, "self_collision": False, "friction_cone": "pyramidal", "physics_timestep": None}
 OBJECT = PLAIN | {"target_distances": [0.0, 10.0], "object_directions": ANYWHERE, "target_directions": ANYWHERE}
 OBJECT |= {
-    "emphasis": None,
     "success_reward": False,
     "target_distance_power": 2,
     "speed": 1.0,
@@ -158,4 +157,4 @@ def test_policies_are_evaluated_in_the_task_of_the_paper(task):
     cfg = composed(f"task={task}", "stage=transfer")
     found = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
     assert {name: found[name] for name in EVALUATED[task]} == EVALUATED[task]
-    assert found.keys() - EVALUATED[task].keys() <= {"discount", "goal_positions"}  # of training alone, or its own
+    assert found.keys() - EVALUATED[task].keys() <= {"goal_positions"}  # its own

@@ -43,7 +43,7 @@ def test_a_box_that_stands_on_the_target_when_the_joint_opens_ends_the_episode_w
     over_the_target,
 ):
     weights = [1.0, 0.2, 1.0, 2.0]
-    env = make(emphasis={"weights": weights, "target_distance_power": 1}, discount=0.9)
+    env = make(curriculum={"reward_weights": weights, "discount": 0.9})
     outcome = play(env, env.reset(over_the_target(env, 0.005), set_state=True), 1)
     full = sum(weights) - np.exp(-1.5) - np.exp(-1)
     assert outcome["success"].all()

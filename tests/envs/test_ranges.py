@@ -62,13 +62,14 @@ def test_wrong_mixtures_are_named_with_a_remedy(mixture, message):
 
 def test_a_negative_distance_in_an_alternative_is_refused():
     with pytest.raises(ValueError, match=r"object_distances=.*begins below 0"):
-        Dribble("biped", 1, num_threads=1, mixture=[{"object_distances": (-1.0, 2.0)}])
+        Dribble("biped", 1, num_threads=1, curriculum={"mixture": [{"object_distances": (-1.0, 2.0)}]})
 
 
 def test_the_objects_of_a_task_lie_where_the_directions_say(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     near = {"object_distances": (1.0, 2.0), "object_directions": (0.2, 0.4), "target_directions": (-0.5, -0.3)}
-    env = Dribble("biped", 100, seed=0, num_threads=1, mixture=[{**near, "target_distances": (1.0, 1.0)}])
+    mixture = [{**near, "target_distances": (1.0, 1.0)}]
+    env = Dribble("biped", 100, seed=0, num_threads=1, curriculum={"mixture": mixture})
     env.reset()
     state = env.get_state()
     place = state["qpos"][:, -7:-5]

@@ -162,10 +162,9 @@ def test_a_method_s_own_settings_are_standard_in_both_stages(write_mcp):
 
 
 def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
-    evaluated = {"speed": 1.0, "initial_states": {"rest": 1.0, "motions": 0.0}, "mixture": []}
-    evaluated["emphasis"] = None
-    trained = {**evaluated, "speed": 1.0, "initial_states": {"rest": 0.2, "motions": 0.8}, "mixture": [{"weight": 2}]}
-    trained |= {"emphasis": {"discount": 0.9}}
+    evaluated = {"speed": 1.0, "curriculum": None}
+    aids = {"initial_states": {"rest": 0.2, "motions": 0.8}, "mixture": [{"weight": 2}], "reward_weights": None}
+    trained = {"speed": 1.0, "curriculum": aids}
     runs = {"plain": evaluated, "practised": trained}
     plain, practised = grouped(
         *(
@@ -177,8 +176,8 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     assert not any(remark.startswith("trained with") for remark in plain.remarks)
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
-        "trained with practice=practised: initial_states.rest=0.2, initial_states.motions=0.8, "
-        "mixture=[{'weight': 2}], emphasis.discount=0.9"
+        "trained with practice=practised: curriculum.initial_states.rest=0.2, "
+        "curriculum.initial_states.motions=0.8, curriculum.mixture=[{'weight': 2}]"
     )
 
 

@@ -22,6 +22,40 @@ def test_a_published_network_that_was_trained_with_what_is_removed_can_be_restor
     assert agent.actor.policy(env.reset())["action"].shape == (2, env.action_spec.shape[-1])
 
 
+def test_settings_of_training_episodes_are_one_setting_in_this_version():
+    rest, states = {"rest": 1.0, "motions": 0.0}, {"rest": 0.2, "motions": 0.8}
+    plain = {
+        "initial_states": rest,
+        "mixture": [],
+        "emphasis": None,
+        "staggered": False,
+        "discount": 0.99,
+        "speed": 1.0,
+    }
+    emphasis = {"weights": [1.0, 0.2, 1.0, 2.0], "target_distance_power": 2}
+    trained = {"initial_states": states, "staggered": True, "emphasis": emphasis, "_target_": "torchrl_mcp.envs.Carry"}
+    made = translated({"task": {"transfer": trained, "evaluation": plain}, "evaluation": {"environment": plain}})
+    assert made["task"]["evaluation"] == made["evaluation"]["environment"] == {"speed": 1.0, "curriculum": None}
+    assert made["task"]["transfer"]["curriculum"] == {
+        "initial_states": states,
+        "mixture": (),
+        "reward_weights": [1.0, 0.2, 1.0, 2.0],
+        "target_distance_power": 2,
+        "random_first_length": True,
+        "discount": 0.99,
+    }
+    assert translated(made) == made
+
+
+@pytest.mark.parametrize("name", ["carry", "dribble", "heading"])
+def test_a_published_gate_can_be_restored_as_it_was_trained(name):
+    cfg, _, env = policies.restore(builtin("mcp", "biped", name), num_envs=2, seed=0)
+    assert cfg.evaluation.environment.curriculum is None
+    assert env.curriculum.initial_states["motions"] > 0
+    assert env.curriculum.random_first_length
+    assert (env.curriculum.reward_weights is None) == (name == "heading")
+
+
 @pytest.mark.parametrize("setting", [{"failure_weighting": 0.5}, {"shaping": {"object": {"slope": 1.0}}}])
 def test_a_run_that_was_trained_with_what_is_removed_cannot_be_resumed(setting, tmp_path, monkeypatch):
     config = {"stage": {"name": "pretrain"}, "task": {"pretrain": setting}}

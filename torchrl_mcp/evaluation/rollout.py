@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.transfer import task_reward
+from torchrl_mcp.envs.pd_character import task_reward
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.evaluation.statistics import mean
 

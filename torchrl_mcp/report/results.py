@@ -13,6 +13,7 @@ from typing import Any, cast
 from omegaconf import OmegaConf
 
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.trust import read_config
 from torchrl_mcp.training.run_folder import (
     CONFIG,
@@ -140,8 +141,8 @@ class Run:
             {name.removeprefix(prefix): value for name, value in self.settings.items() if name.startswith(prefix)}
             for prefix in ("task.transfer.", "task.evaluation.")
         )
-        shared = (name for name in trained if name in evaluated or name.startswith(("emphasis.",)))
-        different = [f"{name}={trained[name]}" for name in shared if trained[name] != evaluated.get(name)]
+        shared = (name for name in trained if name in evaluated or name.startswith("curriculum."))
+        different = [f"{name}={trained[name]}" for name in shared if trained[name] not in (None, evaluated.get(name))]
         return [", ".join(different)] if different else []
 
     @property
@@ -187,7 +188,7 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
 def read_run(folder: Path) -> Run | Damaged:
     """Read a run folder; errors in its files are returned, not raised."""
     try:
-        settings = dict(_leaves(read_config(folder / CONFIG)))
+        settings = dict(_leaves(translated(read_config(folder / CONFIG))))
     except FileNotFoundError:
         return Damaged(folder, f"has no {CONFIG}")
     except (OSError, ValueError) as error:

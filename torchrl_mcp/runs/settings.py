@@ -89,7 +89,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind staggered restart_noise
+        terminate_when_unhealthy success_reward parts.blind random_first_length restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects object_distances
@@ -98,7 +98,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         transfer.directions
     """,
     WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
-    WEIGHTS: "emphasis.weights",
+    WEIGHTS.or_null(): "reward_weights",
     NAMES: "transfer.freeze transfer.keep",
     TEXT: "device run_dir run_root",
     TEXT.or_null(): "pretrained resume",

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from torchrl_mcp.envs import Heading
-from torchrl_mcp.envs.transport import Transport
+from torchrl_mcp.envs import Carry, Dribble, Heading
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
@@ -41,7 +40,7 @@ class Steering:
     @property
     def has_place(self) -> bool:
         """Whether the task has a target to place."""
-        return isinstance(self.player.env, Transport)
+        return isinstance(self.player.env, Carry | Dribble)
 
     @property
     def target_direction(self) -> float:

@@ -15,7 +15,7 @@ KINDS = ("rest", "motions")
 """Kinds of initial states: standing still in the rest pose, and a random moment of a random motion."""
 
 
-class Beginnings:
+class InitialStates:
     """Draws initial states of episodes, with the root over the origin and facing along x.
 
     Args:
@@ -61,6 +61,17 @@ class Beginnings:
         qpos[moving] = placement.qpos(moment.qpos)[moving].double()
         qvel[moving] = placement.qvel(moment.qvel)[moving].double()
         return qpos, qvel
+
+    def fill(self, start: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+        """Return states of a scene with drawn states of the character.
+
+        Args:
+            start: The scene's ``qpos`` and ``qvel``, ``(num, ...)``, in which the character comes first; changed.
+            generator: Source of randomness.
+        """
+        qpos, qvel = self.draw(len(start["qpos"]), generator)
+        start["qpos"][:, : qpos.shape[1]], start["qvel"][:, : qvel.shape[1]] = qpos, qvel
+        return start
 
     def poses(self, interval: float = 0.1) -> Tensor:
         """Possible poses, ``(P, nq)``: the rest pose, and the motions every ``interval`` seconds."""

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading
-from torchrl_mcp.envs.beginnings import Beginnings
+from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.initial_states import InitialStates
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.envs.rotations import heading
 
@@ -13,8 +13,8 @@ MIXED = {"rest": 1.0, "motions": 3.0}
 
 
 def draw(initial_states, num=400, character="biped"):
-    beginnings = Beginnings(character, initial_states, single_motion(character))
-    return beginnings, *beginnings.draw(num, torch.Generator().manual_seed(0))
+    states = InitialStates(character, initial_states, single_motion(character))
+    return states, *states.draw(num, torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("character", CHARACTERS)
@@ -34,16 +34,16 @@ def test_states_in_motion_are_moments_of_the_library_over_the_origin_facing_alon
 
 
 def test_states_are_drawn_with_the_shares_of_their_weights():
-    beginnings, qpos, qvel = draw(MIXED)
+    states, qpos, qvel = draw(MIXED)
     resting = (qvel == 0).all(-1)
-    assert torch.equal(qpos[resting], beginnings.rest.expand(int(resting.sum()), -1))
+    assert torch.equal(qpos[resting], states.rest.expand(int(resting.sum()), -1))
     assert resting.sum().item() == pytest.approx(100, abs=4 * math.sqrt(400 * 0.25 * 0.75))
 
 
 @pytest.mark.parametrize("initial_states", ["rest", {"rest": 2.0}, {"rest": 1.0, "motions": 0.0}])
 def test_rest_alone_needs_no_motions(initial_states):
-    beginnings, _, qvel = draw(initial_states, 5)
-    assert beginnings.library is None
+    states, _, qvel = draw(initial_states, 5)
+    assert states.library is None
     assert not qvel.any()
 
 
@@ -57,12 +57,13 @@ def test_unknown_states_and_weights_that_are_none_are_refused(initial_states):
 
 def test_motions_of_another_character_are_refused():
     with pytest.raises(ValueError, match="motions are of trex: pass motions of character='biped'"):
-        Beginnings("biped", "motions", single_motion("trex"))
+        InitialStates("biped", "motions", single_motion("trex"))
 
 
 @pytest.mark.parametrize("task", [Carry, Dribble, Heading])
 def test_every_transfer_task_begins_in_motion_when_told_to(task):
-    env = task("biped", 200, seed=0, num_threads=1, initial_states=MIXED, motions=single_motion("biped"))
+    curriculum = Curriculum(initial_states=MIXED, motions=single_motion("biped"))
+    env = task("biped", 200, seed=0, num_threads=1, curriculum=curriculum)
     env.reset()
     moving = env.get_state()["qvel"][:, :6].abs().sum(-1) > 0
     assert moving.sum().item() == pytest.approx(150, abs=4 * math.sqrt(200 * 0.25 * 0.75))
@@ -71,8 +72,8 @@ def test_every_transfer_task_begins_in_motion_when_told_to(task):
 @pytest.mark.parametrize("task", [Carry, Dribble])
 @pytest.mark.parametrize("character", CHARACTERS)
 def test_no_object_begins_in_a_character_that_moves(task, character):
-    near = {"object_distances": (0.0, 1.5), "initial_states": "motions", "motions": single_motion(character)}
-    env = task(character, 64, seed=0, num_threads=1, **near)
+    curriculum = Curriculum(initial_states="motions", motions=single_motion(character))
+    env = task(character, 64, seed=0, num_threads=1, object_distances=(0.0, 1.5), curriculum=curriculum)
     env.reset()
     model = env.simulation.model
     for index in range(64):

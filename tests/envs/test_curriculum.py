@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading
 
-EMPHASIS = {"weights": [0.6, 0.1, 1.0, 2.0], "target_distance_power": 1}
+WEIGHTS = [0.6, 0.1, 1.0, 2.0]
+WEIGHED = {"reward_weights": WEIGHTS}
 SCALE = {Carry: 0.25, Dribble: 0.5}
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 
@@ -39,7 +40,7 @@ def places(env):
 
 @every_task
 def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
-    for state, before, (com, thing, target) in outcomes(make(task, emphasis=EMPHASIS, terminate_on_fall=False)):
+    for state, before, (com, thing, target) in outcomes(make(task, curriculum=WEIGHED, terminate_on_fall=False)):
         ahead, left = thing - com, target - thing
         pace = ((com - before[0]) * 30 * ahead).sum(-1) / np.linalg.norm(ahead, axis=-1)
         progress = ((thing - before[1]) * 30 * left).sum(-1) / np.linalg.norm(left, axis=-1)
@@ -52,7 +53,7 @@ def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
 
 def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 1.0), "terminate_on_fall": False}
-    env = make(Dribble, emphasis=EMPHASIS, discount=0.9, **there)
+    env = make(Dribble, curriculum={**WEIGHED, "discount": 0.9}, **there)
     full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
     for_ever = sum(full * 0.9**step for step in range(1000))
     state, generator, successes, others = env.reset(), torch.Generator().manual_seed(0), 0, 0
@@ -70,11 +71,11 @@ def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
 
 
 def test_full_reward_for_ever_needs_a_discount():
-    with pytest.raises(ValueError, match=r"emphasis with discount=1: .* pass a discount below 1"):
-        make(Dribble, emphasis=EMPHASIS, discount=1)
+    with pytest.raises(ValueError, match=r"reward_weights with discount=1: .* pass a discount below 1"):
+        Curriculum(reward_weights=WEIGHTS, discount=1)
 
 
-def test_without_emphasis_a_success_does_not_end_the_episode():
+def test_without_weights_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     outcome = outcomes(make(Dribble, **there), 1)[0][0]
     assert outcome["success"].all()
@@ -82,10 +83,10 @@ def test_without_emphasis_a_success_does_not_end_the_episode():
 
 
 @every_task
-def test_the_task_reward_is_that_of_the_task_without_emphasis(task):
-    emphasised = outcomes(make(task, emphasis=EMPHASIS))
+def test_the_task_reward_is_that_of_the_task_without_weights(task):
+    weighed = outcomes(make(task, curriculum=WEIGHED))
     plain = outcomes(make(task))
-    for (one, *_), (other, *_) in zip(emphasised, plain, strict=True):
+    for (one, *_), (other, *_) in zip(weighed, plain, strict=True):
         assert torch.equal(one["task_reward"], other["reward"])
         assert "task_reward" not in other
         assert not torch.equal(one["reward"], other["reward"])
@@ -94,7 +95,7 @@ def test_the_task_reward_is_that_of_the_task_without_emphasis(task):
 @every_task
 def test_who_has_fallen_earns_neither(task):
     fell = torch.zeros(4, 1, dtype=torch.bool)
-    for state, *_ in outcomes(make(task, emphasis=EMPHASIS), 60, push=1.0):
+    for state, *_ in outcomes(make(task, curriculum=WEIGHED), 60, push=1.0):
         ended = state["terminated"]
         assert (state["reward"][ended] == 0).all()
         assert (state["task_reward"][ended] == 0).all()
@@ -104,17 +105,30 @@ def test_who_has_fallen_earns_neither(task):
 
 def test_standing_still_far_from_everything_earns_nothing():
     far = {"object_distances": (9.0, 10.0), "target_distances": (9.0, 10.0)}
-    state = outcomes(make(Dribble, emphasis=EMPHASIS | {"target_distance_power": 2}, **far), 1, push=0.0)[0][0]
+    state = outcomes(make(Dribble, curriculum=WEIGHED | {"target_distance_power": 2}, **far), 1, push=0.0)[0][0]
     assert state["reward"].abs().max() < 0.03
     assert state["task_reward"].min() > 0.1
 
 
+@pytest.mark.parametrize(("task", "number"), [(Dribble, 3), (Carry, 5), (Heading, 4)])
+def test_other_numbers_of_weights_than_the_reward_has_terms_are_refused(task, number):
+    terms = 0 if task is Heading else 4
+    with pytest.raises(
+        ValueError, match=rf"reward_weights=.* has {terms} terms to weigh, pass as many numbers, or None"
+    ):
+        make(task, curriculum={"reward_weights": [1.0] * number})
+
+
 @pytest.mark.parametrize(
-    "emphasis", [{"weights": [1.0, 1.0, 1.0], "target_distance_power": 1}, {"weights": [1.0] * 4}, {"power": 1}]
+    ("curriculum", "message"),
+    [
+        ({"emphasis": None}, r"curriculum names \['emphasis'\]: pass some of initial_states, motions, mixture"),
+        ({"discount": 0}, "discount=0 is out of range: pass the learner's, above 0 and at most 1"),
+    ],
 )
-def test_a_wrong_emphasis_is_named_with_a_remedy(emphasis):
-    with pytest.raises(ValueError, match=r"emphasis=\{.*pass four weights and a target_distance_power"):
-        make(Dribble, emphasis=emphasis)
+def test_a_wrong_curriculum_is_named_with_a_remedy(curriculum, message):
+    with pytest.raises(ValueError, match=message):
+        make(Heading, curriculum=curriculum)
 
 
 def lengths(env, num_steps):
@@ -130,16 +144,16 @@ def lengths(env, num_steps):
 
 
 def test_the_first_episodes_are_cut_short_one_by_one_and_the_next_last_as_long_as_they_should():
-    env = make(Heading, 4, staggered=True, max_episode_steps=8, terminate_on_fall=False)
+    env = make(Heading, 4, curriculum={"random_first_length": True}, max_episode_steps=8, terminate_on_fall=False)
     assert lengths(env, 20) == [[8, 8], [6, 8], [4, 8, 8], [2, 8, 8]]
     assert lengths(make(Heading, 4, max_episode_steps=8, terminate_on_fall=False), 20) == [[8, 8]] * 4
 
 
-def test_a_staggered_training_goes_on_at_the_same_moments_after_it_was_interrupted():
-    env = make(Heading, 4, staggered=True, max_episode_steps=8)
+def test_a_training_with_shortened_first_episodes_goes_on_at_the_same_moments_after_it_was_interrupted():
+    env = make(Heading, 4, curriculum={"random_first_length": True}, max_episode_steps=8)
     env.step(env.reset().set("action", torch.zeros(env.action_spec.shape)))
     saved, elapsed = env.get_extra_state(), env.episode["elapsed_steps"].clone()
-    other = make(Heading, 4, staggered=True, max_episode_steps=8)
+    other = make(Heading, 4, curriculum={"random_first_length": True}, max_episode_steps=8)
     other.set_extra_state(saved)
     other.reset()
     assert torch.equal(other.episode["elapsed_steps"], elapsed)
@@ -147,7 +161,7 @@ def test_a_staggered_training_goes_on_at_the_same_moments_after_it_was_interrupt
 
 @every_task
 def test_a_diverging_simulation_earns_neither(task):
-    env = make(task, emphasis=EMPHASIS)
+    env = make(task, curriculum=WEIGHED)
     env.reset()
     state = env.get_state()
     state["qvel"][2] = 1e8
