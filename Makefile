@@ -52,7 +52,7 @@ check: $(STAMP) tree
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	cd $(TREE) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p torchrl_mcp
-	cd $(TREE) && PYTHONPATH=. OMP_NUM_THREADS=1 ../../$(BIN)/pytest --doctest-modules --ignore-glob='*/warp_simulation.py' torchrl_mcp
+	cd $(TREE) && PYTHONPATH=. OMP_NUM_THREADS=1 ../../$(BIN)/pytest --doctest-modules --ignore-glob='*/physics/warp.py' torchrl_mcp
 
 DOCS := .venv/.docs
 $(DOCS): $(STAMP)

@@ -37,9 +37,9 @@ import torch
 from report import about, table, write
 from torch import Tensor
 
-from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.pd_character import add_ground
+from torchrl_mcp.envs.physics.batch import BatchSimulation
+from torchrl_mcp.envs.rendering.ground import add_ground
 
 RESULTS = Path(__file__).resolve().parent / "results"
 CONTROL_RATE = 30

@@ -20,7 +20,7 @@ import torch
 from report import about, table, write
 
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.warp_simulation import constraint_room, contact_room
+from torchrl_mcp.envs.physics.warp import constraint_room, contact_room
 from torchrl_mcp.runs import build
 
 RESULTS = Path(__file__).resolve().parent / "results" / "contact_room.csv"

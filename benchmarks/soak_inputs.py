@@ -17,7 +17,7 @@ from zipfile import ZipFile
 
 import torch
 
-from torchrl_mcp.envs.simulation import LARGEST
+from torchrl_mcp.envs.physics.simulation import LARGEST
 from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training import checkpoint
 

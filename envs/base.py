@@ -12,11 +12,11 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_mcp.envs.engines import make_simulation
+from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.mirror import Mirror
-from torchrl_mcp.envs.rendering import Arrow, Camera
-from torchrl_mcp.envs.simulation import LARGEST
+from torchrl_mcp.envs.physics.engines import make_simulation
+from torchrl_mcp.envs.physics.simulation import LARGEST
+from torchrl_mcp.envs.rendering.camera import Arrow, Camera
 
 ALL = slice(None)
 """Index of all simulations that makes no copy."""
@@ -40,14 +40,14 @@ class CharacterEnv(EnvBase):
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
         episode: Task state of one simulation at the beginning of an episode, by name; stored as ``(N, ...)``.
-        outputs: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
-        model_fields: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        outputs: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
+        model_fields: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
         physics: The engine: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
         device: Device of simulations, rewards and outputs; MuJoCo's threads need the CPU.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
-        persistent: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
-        current: See :func:`~torchrl_mcp.envs.engines.make_simulation`.
+        persistent: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
+        current: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
         dtype: Type of the outputs; rewards are computed in float64, physics in the type of the engine.
         pin_memory: Return pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
             TorchRL merges the outputs of a partial reset into new tensors, which are not pinned.)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.characters.kinematics import BodyStates
 from torchrl_mcp.envs.rotations import about_z, multiply, rotate
 
 SIZES = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}

@@ -1,23 +1,24 @@
 """Characters under PD control: state, falls and scene, for all their tasks."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any
 
 import mujoco
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mcp.envs.arrays import as_array, as_tensor
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
+from torchrl_mcp.envs.characters.kinematics import BodyStates, origin_velocities
+from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_state
 from torchrl_mcp.envs.curriculum import Curriculum
-from torchrl_mcp.envs.mirror import Mirror, mirror_actions, mirror_state
-from torchrl_mcp.envs.motions.kinematics import BodyStates
 from torchrl_mcp.envs.observations import character_state, state_layout
+from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
+from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
 
 CONTROL_TIMESTEP = 1 / 30
@@ -27,8 +28,6 @@ TASK_REWARD = "task_reward"
 """Key of the task's own reward in environments that train with another."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-
-Numbers = TypeVar("Numbers", Tensor, np.ndarray)
 
 
 class PDCharacterEnv(CharacterEnv):
@@ -134,7 +133,6 @@ class PDCharacterEnv(CharacterEnv):
         self._geom_axes = as_array(outputs["geom_xmat"]).reshape(num_envs, -1)
         axes = torch.tensor([[6], [7], [8]])
         self._vertical_columns = as_array((9 * shapes[0] + axes).flatten().to(self.device))
-        self._array_type = torch.empty(0, dtype=self._dtype).numpy().dtype
         self._seen = [as_array(outputs[key])[:, 1:] for key in ("xpos", "xquat", "cvel")]
         trees = torch.from_numpy(model.body_rootid[1:]).to(self.device)
         self._centres = as_array(outputs["subtree_com"]), as_array(trees if len(trees.unique()) > 1 else trees[:1])
@@ -211,15 +209,12 @@ class PDCharacterEnv(CharacterEnv):
         """States of all bodies in the world, in ``dtype``; stored by component, for speed."""
         rows = ids if isinstance(ids, slice) else as_array(ids)
         centres, trees = self._centres
-        if self.device.type != "cpu":
-            return body_states([part[rows] for part in self._seen], centres[rows][:, trees], self._dtype)
-        positions, orientations, twists = (part[rows].transpose(1, 2, 0) for part in self._seen)
-        arms = np.subtract(positions, centres[rows][:, trees].transpose(1, 2, 0), order="C")
-        angular, linear = np.ascontiguousarray(twists[:, :3]), twists[:, 3:]
-        # MuJoCo's cvel is the velocity of each body at the point of the centre of mass of its tree.
-        across = angular[:, [1, 2, 0]] * arms[:, [2, 0, 1]] - angular[:, [2, 0, 1]] * arms[:, [1, 2, 0]]
-        parts = (positions, orientations, across + linear, angular)
-        return BodyStates(*(torch.from_numpy(part.astype(self._array_type, "C")).permute(2, 0, 1) for part in parts))
+        seen = (*(part[rows] for part in self._seen), centres[rows][:, trees])
+        positions, orientations, twists, centres = map(by_component, seen)
+        angular = contiguous(twists[:, :3])
+        linear = origin_velocities(angular, twists[:, 3:], contiguous(positions - centres))
+        parts = (positions, orientations, linear, angular)
+        return BodyStates(*(converted(part, self._dtype).permute(2, 0, 1) for part in parts))
 
     def _action_bounds(self) -> Tensor:
         return torch.tensor([-1.0, 1.0]).expand(self.simulation.model.nu, 2)
@@ -234,97 +229,6 @@ class PDCharacterEnv(CharacterEnv):
         if self.curriculum.random_first_length and num == self.num_envs:
             start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
         return start
-
-
-def body_states(parts: Sequence[Tensor], centres: Tensor, dtype: torch.dtype) -> BodyStates:
-    """Convert MuJoCo's outputs to the states of bodies in the world.
-
-    Args:
-        parts: ``xpos``, ``xquat`` and ``cvel`` of L bodies, each ``(n, L, ...)``.
-        centres: Centre of mass of each body's tree, ``(n, L, 3)``, or of the only tree, ``(n, 1, 3)``.
-        dtype: Type of the states.
-    """
-    positions, orientations, twists = parts
-    angular, linear = twists.split(3, -1)
-    # MuJoCo's cvel is the velocity of each body at the point of the centre of mass of its tree.
-    linear = linear + torch.linalg.cross(angular, positions - centres)
-    return BodyStates(*(part.to(dtype) for part in (positions, orientations, linear, angular)))
-
-
-def add_ground(spec: mujoco.MjSpec) -> None:
-    """Add flat ground, sky and light to a character's scene."""
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        width=64,
-        height=6 * 64,
-        rgb1=[0.45, 0.62, 0.82],
-        rgb2=[0.87, 0.90, 0.94],
-    )
-    spec.add_texture(
-        name="ground",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        width=256,
-        height=256,
-        rgb1=[0.62, 0.66, 0.70],
-        rgb2=[0.70, 0.74, 0.78],
-    )
-    material = spec.add_material(name="ground", texrepeat=[0.5, 0.5], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
-    spec.worldbody.add_geom(
-        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground", contype=1, conaffinity=1
-    )
-    # The light follows the character, because MuJoCo draws shadows only near the lit point.
-    sun, follow = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_TRACK
-    spec.bodies[1].add_light(name="sun", type=sun, mode=follow, pos=[3, -4, 10], dir=[-0.3, 0.4, -1])
-    spec.visual.map.shadowclip = 20.0  # beyond the shadow map the ground is speckled
-
-
-def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The geoms that must not touch the ground: colliding geoms of all bodies except the feet.
-
-    Returns:
-        Their ids ``(G,)``, half-sizes ``(G, 3)`` and radii ``(G,)`` for :func:`lowest_points`.
-    """
-    owners = torch.tensor(model.geom_bodyid)
-    others = torch.tensor([model.body(body).id for body in feet])
-    collides = torch.tensor(model.geom_contype | model.geom_conaffinity) != 0
-    ids = ((owners > 0) & (owners <= num_bodies) & collides & ~torch.isin(owners, others)).nonzero().squeeze(-1)
-    kinds = [mujoco.mjtGeom(kind) for kind in model.geom_type[ids.numpy()]]
-    half_sizes, radii = torch.zeros(len(ids), 3, dtype=torch.float64), torch.zeros(len(ids), dtype=torch.float64)
-    for row, (kind, size) in enumerate(zip(kinds, torch.tensor(model.geom_size[ids.numpy()]), strict=True)):
-        match kind:
-            case mujoco.mjtGeom.mjGEOM_SPHERE:
-                radii[row] = size[0]
-            case mujoco.mjtGeom.mjGEOM_CAPSULE:
-                radii[row], half_sizes[row, 2] = size[0], size[1]
-            case mujoco.mjtGeom.mjGEOM_BOX:
-                half_sizes[row] = size
-            case _:
-                raise ValueError(f"a character has a colliding {kind.name}: use spheres, capsules and boxes")
-    return ids, half_sizes, radii
-
-
-def lowest_points(heights: Numbers, vertical: Numbers, half_sizes: Numbers, radii: Numbers) -> Numbers:
-    r"""Height of the lowest point of spheres, capsules and boxes.
-
-    .. math:: z - r - \sum_i |R_{3i}| h_i
-
-    Each is the set of points within a radius :math:`r` of a box of half-sizes :math:`h`, turned by :math:`R`. For a
-    sphere the box is a point, for a capsule a line, and for a box the radius is 0.
-
-    Args:
-        heights: Heights z of the centres in metres, shape ``(*B, G)``.
-        vertical: Last row of each rotation matrix, shape ``(*B, G, 3)``.
-        half_sizes: Half-sizes h in metres, shape ``(G, 3)``.
-        radii: Radii r in metres, shape ``(G,)``.
-
-    Returns:
-        Heights, shape ``(*B, G)``, in metres.
-    """
-    return heights - radii - (abs(vertical) * half_sizes).sum(-1)
 
 
 def task_reward(outcome: TensorDictBase) -> Tensor:

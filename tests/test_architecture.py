@@ -23,6 +23,20 @@ ORDER = (
 )
 """Folders of ``torchrl_mcp``, of which each may import those before it."""
 RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folders}
+ROOMS = (
+    {"arguments", "rotations"},
+    {"physics"},
+    {"characters"},
+    {"rendering"},
+    {"motions"},
+    {"observations", "ideal", "curriculum"},
+    {"base"},
+    {"pd_character"},
+    {"tasks"},
+    {"gymnasium_env"},
+)
+"""Folders and modules of ``torchrl_mcp.envs``, of which each may import those before it."""
+ROOM_RANKS = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 HYDRA = {"torchrl_mcp.runs.build", "torchrl_mcp.runs.benchmark"}
 """Modules beside those of ``cli`` that may import Hydra: one makes what it configures, one drives its launchers."""
 WITHOUT_HYDRA = {folder for folders in ORDER[:6] for folder in folders} | {"analysis", "viewer", "envs"}
@@ -79,6 +93,19 @@ def test_environments_know_nothing_of_what_learns():
             assert all(folder(other) == "envs" for other in ours), f"{module} imports {ours}"
 
 
+def room(name):
+    return name.split(".")[2] if folder(name) == "envs" and name.count(".") > 1 else None
+
+
+def test_a_room_of_the_environments_imports_none_that_builds_on_it():
+    inside = [module for module in MODULES if room(module)]
+    assert {room(module) for module in inside} == ROOM_RANKS.keys()
+    for module in inside:
+        others = {other for other in IMPORTS[module] if room(other) and room(other) != room(module)}
+        above = {other for other in others if ROOM_RANKS[room(other)] >= ROOM_RANKS[room(module)]}
+        assert not above, f"{module} imports {above}"
+
+
 def test_no_modules_import_one_another_in_a_circle():
     done = set()
 
@@ -100,7 +127,7 @@ def test_hydra_is_imported_at_the_door_alone_and_without_its_internals():
     assert not [other for name in using for other in IMPORTS[name] if "._" in other]
 
 
-OF_EXTRAS = {"torchrl_mcp.envs.warp_simulation"} if find_spec("mujoco_warp") is None else set()
+OF_EXTRAS = {"torchrl_mcp.envs.physics.warp"} if find_spec("mujoco_warp") is None else set()
 """What imports an extra that is not there."""
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_mcp.envs import opengl
+from torchrl_mcp.envs.rendering import opengl
 
 NOTEBOOK = json.loads((Path(__file__).parents[1] / "docs" / "notebooks" / "first_steps.ipynb").read_text())
 SMALLER = {"STEPS = 60_000": "STEPS = 4_000", "SECONDS = 6.0": "SECONDS = 0.2"}

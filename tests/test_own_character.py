@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from torchrl_mcp.cli import character, play, train
-from torchrl_mcp.envs import opengl
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.rendering import opengl
 
 TUTORIAL = (Path(__file__).parents[1] / "docs" / "tutorials" / "character.md").read_text()
 PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)

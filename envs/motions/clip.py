@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.joints import JointLayout, joint_layout
 from torchrl_mcp.envs.motions.errors import MotionFormatError
-from torchrl_mcp.envs.motions.joints import JointLayout, joint_layout
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
 
@@ -51,7 +51,7 @@ class MotionClip:
 
     Example:
         >>> import torch
-        >>> from torchrl_mcp.envs.motions.joints import character_model
+        >>> from torchrl_mcp.envs.characters.joints import character_model
         >>> gliding = torch.from_numpy(character_model("humanoid").qpos0).repeat(2, 1)
         >>> gliding[1, 0] += 0.5
         >>> clip = MotionClip("humanoid", gliding, fps=2.0, loop=True)

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.characters.kinematics import BodyStates, body_names
 from torchrl_mcp.envs.rotations import rotate
 
 
@@ -32,7 +32,7 @@ def contact_points(character: str, body: str, states: BodyStates) -> ContactPoin
     Args:
         character: Name of the character.
         body: Name of the body.
-        states: States of all bodies, from :func:`~torchrl_mcp.envs.motions.kinematics.body_states`, T frames.
+        states: States of all bodies, from :func:`~torchrl_mcp.envs.characters.kinematics.body_states`, T frames.
     """
     offsets, radii = _outline(character_model(character), body)
     index = body_names(character).index(body)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.joints import joint_layout
+from torchrl_mcp.envs.characters.kinematics import BodyStates, body_names, body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.joints import joint_layout
-from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names, body_states
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous
 

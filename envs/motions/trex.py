@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.joints import character_model, joint_layout
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.joints import character_model, joint_layout
 from torchrl_mcp.envs.motions.keyframes import Keyframes, halting, minimum_jerk, smooth
 from torchrl_mcp.envs.motions.placement import Placement
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, from_rotation_vector, inverse, multiply, rotate

@@ -12,7 +12,8 @@ from contextlib import redirect_stdout
 import torch
 from stand_in import NAME, Accelerator, PretendTensor, register
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library, warp_simulation
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library
+from torchrl_mcp.envs.physics import warp
 
 NUM_ENVS, NUM_STEPS = 4, 12
 TERMS = {name: {"weight": 0.1, "scale": 1.0} for name in ("pose", "velocity", "root_pose", "key_positions", "com")}
@@ -20,21 +21,21 @@ TERMS = {name: {"weight": 0.1, "scale": 1.0} for name in ("pose", "velocity", "r
 
 def main():
     """Rehearse the scenes of the command line."""
-    kept, cpu = register(), warp_simulation.wp.get_device("cpu")
-    plain_view, plain_device = warp_simulation._view, warp_simulation.wp.device_from_torch
+    kept, cpu = register(), warp.wp.get_device("cpu")
+    plain_view, plain_device = warp._view, warp.wp.device_from_torch
     torch.Generator = lambda device="cpu", plain=torch.Generator: plain()  # the stand-in has none
     found = {}
     with redirect_stdout(sys.stderr):
         for scene in sys.argv[1:]:
             expected = rollout(make(scene, "cpu"))
-            warp_simulation._view = lambda array: PretendTensor(plain_view(array))
-            warp_simulation.wp.device_from_torch = lambda device: cpu
+            warp._view = lambda array: PretendTensor(plain_view(array))
+            warp.wp.device_from_torch = lambda device: cpu
             with Accelerator():
                 env = make(scene, NAME)
                 waits = count()
                 observed = rollout(env)
                 PretendTensor.on_wait = staticmethod(lambda operation: None)
-            warp_simulation._view, warp_simulation.wp.device_from_torch = plain_view, plain_device
+            warp._view, warp.wp.device_from_torch = plain_view, plain_device
             apart = max(float((one.cpu() - other).abs().max()) for one, other in zip(observed, expected, strict=True))
             found[scene] = {"waits": waits, "apart": apart}
     print(json.dumps(found))

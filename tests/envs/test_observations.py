@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.motions.kinematics import BodyStates
+from torchrl_mcp.envs.characters.kinematics import BodyStates
 from torchrl_mcp.envs.observations import character_state, state_layout
 from torchrl_mcp.envs.rotations import heading
 

@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.pd_character import falling_geoms, lowest_points
+from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
 
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_mcp.envs import opengl
+from torchrl_mcp.envs.rendering import opengl
 from torchrl_mcp.runs import experiment
 from torchrl_mcp.viewer.recorder import draw_weights
 

@@ -8,8 +8,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.kinematics import body_names
-from torchrl_mcp.envs.pd_character import PDCharacterEnv, falling_geoms, lowest_points
+from torchrl_mcp.envs import PDCharacterEnv
+from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
+from torchrl_mcp.envs.characters.kinematics import body_names
 
 CLEARANCE = 0.003
 """Height in metres below which a foot stands; the bounce after touch-down is lower."""

@@ -25,7 +25,7 @@ from torchrl.envs import Compose
 from torchrl.record.loggers.common import Logger
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.envs.engines import require_engine
+from torchrl_mcp.envs.physics.engines import require_engine
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv

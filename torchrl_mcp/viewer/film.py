@@ -13,13 +13,13 @@ from tqdm import tqdm
 
 from torchrl_mcp.analysis.figures import INK
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.envs.rendering import Camera, save_gif
-from torchrl_mcp.envs.scenery import softly_lit
+from torchrl_mcp.envs.rendering.camera import Camera, save_gif
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.viewer.bars import draw_bars
 from torchrl_mcp.viewer.formats import ENCODER, EVERY, require_format
 from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.viewer.scenery import softly_lit
 
 AZIMUTH, ELEVATION = 115.0, -26.0
 """Camera angles in degrees: a character walking along x is seen from the right, a little from the front and above."""

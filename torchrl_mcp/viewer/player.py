@@ -10,9 +10,9 @@ from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.envs.rendering import Shape
-from torchrl_mcp.envs.scenery import extent, scenery
+from torchrl_mcp.envs.rendering.camera import Shape
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.viewer.scenery import extent, scenery
 
 
 class Weights(NamedTuple):

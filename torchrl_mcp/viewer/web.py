@@ -7,13 +7,13 @@ import mujoco
 from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from mujoco.experimental.studio import launch_web, messages, plugin, sim, ux, viewer_app, viewer_protocol
 
-from torchrl_mcp.envs.rendering import Shape
-from torchrl_mcp.envs.scenery import softly_lit
+from torchrl_mcp.envs.rendering.camera import Shape
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.guard import HERE, guarded
 from torchrl_mcp.viewer.mouse import Mouse
 from torchrl_mcp.viewer.panel import Command, draw
 from torchrl_mcp.viewer.player import Player, Weights
+from torchrl_mcp.viewer.scenery import softly_lit
 from torchrl_mcp.viewer.steering import TURN, Steering
 
 FURTHER = 1.4

@@ -10,10 +10,10 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
-from torchrl_mcp.envs.rendering import add_shapes
-from torchrl_mcp.envs.scenery import softly_lit
+from torchrl_mcp.envs.rendering.camera import add_shapes
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.player import Player, Weights
+from torchrl_mcp.viewer.scenery import softly_lit
 from torchrl_mcp.viewer.steering import TURN, Steering
 
 LENGTH = 24

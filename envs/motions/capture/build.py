@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.motions.kinematics import body_states
 from torchrl_mcp.envs.rotations import from_rotation_vector, to_rotation_vector
 
 HUMANS = ("humanoid", "biped")

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, SIDES, TRUNK, limb
 from torchrl_mcp.envs.motions.capture.build import assembled, require_human, speeds
 from torchrl_mcp.envs.motions.capture.recording import Recording, record
 from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate
 
 BENT = math.radians(15)

@@ -7,11 +7,11 @@ import mujoco
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.gait.course import SIDES, Course
 from torchrl_mcp.envs.motions.gait.curves import wave
 from torchrl_mcp.envs.motions.gait.feet import Sole
 from torchrl_mcp.envs.motions.gait.legs import Leg
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, inverse, multiply, rotate
 
 PELVIS_LEAN, TRUNK_LEAN = 0.1, 0.53

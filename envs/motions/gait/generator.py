@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.body import build_of, head_and_arms, pelvis_orientation, trunk_orientation
 from torchrl_mcp.envs.motions.gait.course import GRAVITY, SIDES, Course, Side, plan, stride_rate
 from torchrl_mcp.envs.motions.gait.curves import settled
 from torchrl_mcp.envs.motions.gait.feet import Foot, step
 from torchrl_mcp.envs.motions.gait.legs import leg_joints, pelvis_height
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import inverse, multiply
 
 WALKERS = ("humanoid", "biped")

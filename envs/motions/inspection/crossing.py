@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.characters.joints import character_model
 
 FURTHEST = 1.0
 """Largest distance in metres that is measured."""

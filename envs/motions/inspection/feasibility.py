@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model, joint_layout
+from torchrl_mcp.envs.characters.kinematics import body_names, body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
 from torchrl_mcp.envs.motions.inspection.crossing import legs_apart
-from torchrl_mcp.envs.motions.joints import character_model, joint_layout
-from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import to_rotation_vector
 
 TOUCH = 0.02

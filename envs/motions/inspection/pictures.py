@@ -10,10 +10,10 @@ from PIL import Image
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.pd_character import add_ground
-from torchrl_mcp.envs.rendering import Camera, save_gif
+from torchrl_mcp.envs.rendering.camera import Camera, save_gif
+from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
 
 FILM_FPS = 25.0

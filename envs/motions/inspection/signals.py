@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.characters.kinematics import BodyStates, body_names
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.motions.kinematics import BodyStates, body_names
 from torchrl_mcp.envs.motions.smoothing import smoothed
 from torchrl_mcp.envs.rotations import heading, rotate
 

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.inspection.signals import LegSignals, RootSignals, leg_signals, root_signals, unwrapped
 from torchrl_mcp.envs.motions.inspection.strides import Stride, find_strides
-from torchrl_mcp.envs.motions.kinematics import body_states
 from torchrl_mcp.envs.motions.smoothing import smoothed
 from torchrl_mcp.envs.rotations import heading
 

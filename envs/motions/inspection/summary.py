@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.kinematics import body_names, body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.kinematics import body_names, body_states
 from torchrl_mcp.envs.rotations import heading
 
 SWINGING = 1.0

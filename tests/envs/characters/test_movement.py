@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.batch_simulation import BatchSimulation
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.physics.batch import BatchSimulation
 
 BALL, HINGE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE
 

@@ -1,7 +1,7 @@
 import mujoco
 import pytest
 
-from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.characters.joints import character_model
 
 
 @pytest.fixture(scope="session")

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride, walk
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.motions.kinematics import body_states
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.placement import Placement
 from torchrl_mcp.envs.rotations import inverse, multiply, to_rotation_vector

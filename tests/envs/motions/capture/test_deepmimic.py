@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
-from torchrl_mcp.envs.motions.joints import character_model
 
 BALLS = [1.0, 0.0, 0.0, 0.0]
 HUMANOID = ["root", "chest", "neck", "right_hip", "right_knee", "right_ankle", "right_shoulder", "right_elbow"]

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.contacts import contact_points
 from torchrl_mcp.envs.motions.gait.generator import stride, walk
 from torchrl_mcp.envs.motions.inspection.statistics import gait_statistics
-from torchrl_mcp.envs.motions.joints import character_model
-from torchrl_mcp.envs.motions.kinematics import body_states
 from torchrl_mcp.envs.rotations import heading
 
 WALKERS = ["humanoid", "biped"]

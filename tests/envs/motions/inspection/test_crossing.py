@@ -3,12 +3,12 @@ import math
 import pytest
 import torch
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.corpus import turning_clips, walking_corpus
 from torchrl_mcp.envs.motions.inspection.crossing import legs_apart
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.motions.trex import trex_corpus
 
 RECORDINGS = (

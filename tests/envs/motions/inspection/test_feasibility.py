@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import walk
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_x, about_y
 
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 from PIL import Image
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, pictures, save_film, save_picture
-from torchrl_mcp.envs.motions.joints import character_model
 
 
 def turned(yaw, *, x=0.0, frames=2, fps=1.0):

@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.inspection.signals import unwrapped
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics, speed_and_turn_rate
-from torchrl_mcp.envs.motions.joints import character_model
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, multiply
 
 STRIDE = 1.2

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.inspection.summary import summarised
-from torchrl_mcp.envs.motions.joints import character_model
 
 
 def standing(frames, fps=10.0):

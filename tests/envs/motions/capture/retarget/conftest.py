@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.importer import import_motion
-from torchrl_mcp.envs.motions.joints import character_model
 
 # A body in a T-pose, y up, z forward, x left, in metres: joint, parent, offset. The soles are 5 cm below the ankles.
 BODY = [

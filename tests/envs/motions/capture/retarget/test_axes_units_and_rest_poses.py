@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
-from torchrl_mcp.envs.motions.joints import character_model
 
 AXES = {
     "z up, x forward": np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]),

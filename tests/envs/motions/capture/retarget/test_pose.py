@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.motions.joints import character_model
+from torchrl_mcp.envs.characters.joints import character_model
 
 X, Y, Z = np.eye(3)
 

@@ -1,0 +1,1 @@
+"""Physics engines: many simulations of one model as torch tensors."""

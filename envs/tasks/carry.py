@@ -1,0 +1,339 @@
+"""The carry task: bring a box from one table to another."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import mujoco
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.mirror import Mirror
+from torchrl_mcp.envs.ideal import Reach, transport_reach
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
+from torchrl_mcp.envs.tasks.initial_states import InitialStates
+from torchrl_mcp.envs.tasks.rewards import carry_reward, reward_until_success
+from torchrl_mcp.envs.tasks.transport import (
+    ANY_DIRECTION,
+    goal_layout,
+    goal_mirror,
+    goal_of,
+    horizontal_extent,
+    mocap_positions,
+    placement,
+    places,
+    pointers,
+    require_transport,
+)
+
+OBJECTS = {"target": 7, "source": 7, "box": 13}
+"""The objects in the order of the scene: target table, source table and box. How many numbers the goal has of each:
+position (3), orientation (4), linear (3) and angular velocity (3)."""
+
+MASS = 5.0
+"""Mass of the box, in kg. Paper: 5."""
+
+# The paper states no sizes. The tops end just inside the box, so that a character at a table touches the box first.
+HALF_SIZE = 0.15
+TOP_HALF_SIZE = 0.14
+TOP_THICKNESS = 0.03
+DROP = 0.05
+"""Metres by which the target's top is lower than the source's: a box carried at its initial height passes over it."""
+
+TOP_CONTACT = 2
+"""MuJoCo's contact bit of the tops, which only the box shares: for characters, tops would be walls."""
+
+RESTING_GAP = 0.01
+"""Largest distance in metres between box and top at which the box stands on the top."""
+
+RELEASE_GAP = DROP + RESTING_GAP
+"""Largest distance in metres between box and top at which the joint opens, reached at the box's initial height."""
+
+
+class Carry(PDCharacterEnv):
+    """A character takes a box from a source table to a target table.
+
+    The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
+    to the carrier. The joint opens once the box is over the target, less than 6 cm above it, and does not close again
+    within the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest
+    point is less than 1 cm above it. A box that was knocked off the source cannot be taken. ``box_taken`` (1, bool) is
+    whether the box was taken in this episode, and ``success`` (1, bool) whether it then was let go and stands on the
+    target.
+
+    ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
+    angular velocity of the box, in the character's heading frame, with positions relative to the root; ``goal_layout``
+    has the names of its entries. A table's position is the middle of its top.
+
+    At the source's height, the box is level with the carrier's centre of mass in the rest pose. Tables hold the box;
+    characters pass through them, because a top at waist height would be a wall. The carrier passes through the box,
+    because contact would work against the joint.
+
+    The reward is by default as printed in the paper. Two variants of the same authors' public code are options: the
+    distance to the target instead of its square, which still has a gradient at 10 m, and reward 1 while successful. A
+    box at rest on the target has a printed reward of at most 0.73; with the second variant it is 1.
+
+    With ``reward_weights`` of a curriculum, training uses
+    :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`, and a success ends the episode.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        object_distances: Range (lo, hi) of the box's distance from the character, in metres. The paper's begins at 0;
+            here lo is raised until the box touches no character.
+        object_directions: Range (lo, hi) of the direction of the box, in radians from the character's heading.
+        target_distances: Range (lo, hi) of the target's distance from the box, in metres. The paper's begins at 0; here
+            lo is raised until the tables are apart.
+        target_directions: Range (lo, hi) of the direction from the box to the target, in radians from the direction of
+            the box: 0 is straight beyond the box.
+        speed: Target speed of character and box, in m/s. Paper: 1.
+        target_distance_power: Power of the distance between box and target in the reward: 2 (paper) or 1.
+        success_reward: Set the reward to 1 while successful.
+        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
+            :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A table is 0.3 m wide, and in standardised metres
+            this is less than a tenth.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
+            3000 are 100 s, as in the same authors' public code for a ball.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range, or the character has no carrier.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        appendix D, https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> env = Carry("biped", num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "goal"].shape
+        torch.Size([2, 3, 27])
+    """
+
+    num_reward_terms = 4
+
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        object_distances: Sequence[float] = (0.0, 10.0),
+        object_directions: Sequence[float] = ANY_DIRECTION,
+        target_distances: Sequence[float] = (0.0, 10.0),
+        target_directions: Sequence[float] = ANY_DIRECTION,
+        speed: float = 1.0,
+        target_distance_power: float = 2,
+        success_reward: bool = False,
+        goal_positions: str = "metres",
+        max_episode_steps: int = 3000,
+        **kwargs: Any,
+    ) -> None:
+        require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
+        self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
+        self.goal_positions, self.goal_layout = goal_positions, goal_layout(OBJECTS)
+        super().__init__(
+            character,
+            num_envs,
+            furnish=self._furnish,
+            model_fields=["eq_data"],
+            max_episode_steps=max_episode_steps,
+            episode={"taken": torch.zeros((), dtype=torch.float64)},
+            **kwargs,
+        )
+        self.initial_states = InitialStates(
+            character, self.curriculum.initial_states, self.curriculum.motions, self.device
+        )
+        self.ranges = placement(
+            self.curriculum.mixture,
+            object_distances=object_distances,
+            object_directions=object_directions,
+            target_distances=target_distances,
+            target_directions=target_directions,
+        )
+        self._keep_clear()
+        self.ranges.to(self.device)
+        # Live views, made once.
+        model, state, outputs = self.simulation.model, self.simulation.state, self.simulation.outputs
+        self._carrier, self._box = self.pose(str(self.character.carrier)), self.pose("box")
+        self._tables = {name: self.pose(name) for name in ("source", "target")}
+        self._vertical, self._gaps = outputs["geom_xmat"][:, model.geom("box").id, 6:], outputs["sensordata"]
+        self._joined, self._joint = state["eq_active"][:, 0], state["eq_data"][:, 0, 3:10]
+        self.track(object=self._box[0])
+        self.make_specs()
+
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The box on the source, and the target, at drawn places; both tables, and the box, face anywhere."""
+        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        box, target = places(start["qpos"][:, :2], self.ranges.draw(num, self.generator))
+        angles = torch.rand(num, 2, dtype=torch.float64, device=self.device, generator=self.generator)
+        turns, tables = about_z(2 * math.pi * angles), self._marks.repeat(num, 1, 1)
+        tables[:, :, :2] = torch.stack([target, box], 1)
+        start["qpos"][:, -7:-5], start["qpos"][:, -4:] = box, turns[:, 1]
+        return {**start, "mocap_pos": tables, "mocap_quat": turns}
+
+    def after_step(self, diverged: Tensor) -> None:
+        """Fix the box to a carrier that touches it on the source, and let it go over the target."""
+        touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
+        closing = self._over(touching, "source", RESTING_GAP)
+        opening = self._over(self._joined == 1, "target", RELEASE_GAP)
+        if len(closing):
+            self._joint[closing] = relative_pose(*(part[closing] for part in (*self._carrier, *self._box)))
+            self._joined[closing] = self.episode["taken"][closing] = 1
+        self._joined[opening] = 0
+
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """State of the character, and where it sees tables and box."""
+        state, objects = self.see(ids)
+        return {
+            "observation": state,
+            "goal": goal_of(objects, OBJECTS, self.goal_positions),
+            "success": self.success()[ids].unsqueeze(-1),
+            "box_taken": self.episode["taken"][ids].bool().unsqueeze(-1),
+        }
+
+    def reward(self) -> Tensor:
+        """Reward of appendix D, or 1 while successful."""
+        reward = carry_reward(*self._motion(), speed=self.speed, target_distance_power=self.target_distance_power)
+        return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
+
+    def training_reward(self) -> Tensor:
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`."""
+        aids, weights = self.curriculum, self.curriculum.reward_weights
+        assert weights is not None
+        power = aids.target_distance_power
+        reward = carry_reward(*self._motion(), weights=weights, speed=self.speed, target_distance_power=power)
+        return reward_until_success(reward, self.success(), weights=weights, speed=self.speed, discount=aids.discount)
+
+    def terminated(self) -> Tensor:
+        """Whether a success ends the episode, as it does in training with other weights of the reward."""
+        return super().terminated() if self.curriculum.reward_weights is None else self.success()
+
+    def success(self) -> Tensor:
+        """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
+        put_down = (self.episode["taken"] == 1) & (self._joined == 0)
+        success = torch.zeros_like(put_down)
+        success[self._over(put_down, "target", RESTING_GAP)] = True
+        return success
+
+    def reach(self) -> Reach:
+        """Returns of standing still, and of an ideal player that takes the box straight to its target."""
+        com, _, box, _, target = self._motion()
+        return transport_reach(
+            partial(carry_reward, speed=self.speed, target_distance_power=self.target_distance_power),
+            *(place.clone() for place in (com, box, target)),
+            speed=self.speed,
+            timestep=self.control_timestep,
+            num_steps=self.max_episode_steps,
+            success_distance=TOP_HALF_SIZE if self.success_reward else 0.0,
+        )
+
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
+        return goal_mirror(OBJECTS)
+
+    def arrows(self, index: int) -> list[Arrow]:
+        """Arrows from above the character to the box, and from above the box to the target."""
+        return pointers(self.com[index], self._box[0][index], self._tables["target"][0][index])
+
+    def _motion(self) -> tuple[Tensor, ...]:
+        """Horizontal centre of mass, its velocity, place and velocity of the box, and the target, each ``(N, 2)``."""
+        box, target = self._box[0], self._tables["target"][0]
+        parts = (self.com, self.velocity("com"), box, self.velocity("object"), target)
+        return tuple(part[:, :2] for part in parts)
+
+    def _over(self, candidates: Tensor, table: str, gap: float) -> Tensor:
+        """Simulations among ``candidates``, ``(N,)`` bool, in which the box is over a table, ``(n,)``.
+
+        The lowest point of the box is less than ``gap`` metres above the top.
+        """
+        ids = candidates.nonzero().squeeze(-1)
+        if not len(ids):
+            return ids
+        position, orientation = (part[ids] for part in self._tables[table])
+        from_middle = rotate(inverse(orientation), self._box[0][ids] - position)
+        above = from_middle[:, 2] - HALF_SIZE * self._vertical[ids].abs().sum(-1)
+        return ids[(from_middle[:, :2].abs() < TOP_HALF_SIZE).all(-1) & (from_middle[:, 2] > 0) & (above < gap)]
+
+    def _furnish(self, spec: mujoco.MjSpec) -> None:
+        """Add tables, box and the joint between carrier and box to the scene."""
+        carrier = self.character.carrier
+        if carrier is None:
+            able = ", ".join(name for name, character in CHARACTERS.items() if character.carrier)
+            raise ValueError(f"character={self.character.name!r} has no body to carry a box with: pass one of {able}")
+        height = height_of(spec, carrier)
+        add_table(spec, "target", height - HALF_SIZE - DROP, rgba=(0.75, 0.2, 0.15, 1.0))
+        add_table(spec, "source", height - HALF_SIZE, rgba=(0.3, 0.45, 0.6, 1.0))
+        add_box(spec, height)
+        add_joint(spec, carrier)
+
+    def _keep_clear(self) -> None:
+        """Let the box begin where it touches no character, and the tables apart."""
+        model = self.simulation.model
+        self._marks = mocap_positions(model).to(self.device)
+        width, source = math.sqrt(2) * HALF_SIZE, float(self._marks[1, 2])
+        extent = horizontal_extent(
+            model, len(self._bodies), self.initial_states.poses(), source, source + 2 * HALF_SIZE
+        )
+        self.ranges.keep_clear("object_distances", width + extent)
+        self.ranges.keep_clear("target_distances", 2 * width)
+
+
+def relative_pose(position: Tensor, orientation: Tensor, other_position: Tensor, other_orientation: Tensor) -> Tensor:
+    """Another body's position and orientation in a body's frame, shape ``(*B, 7)``."""
+    back = inverse(orientation)
+    return torch.cat([rotate(back, other_position - position), multiply(back, other_orientation)], -1)
+
+
+def height_of(spec: mujoco.MjSpec, body: str) -> float:
+    """Height of a body's centre of mass in the rest pose, in metres."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return float(data.body(body).xipos[2])
+
+
+def add_table(spec: mujoco.MjSpec, name: str, height: float, rgba: tuple[float, float, float, float]) -> None:
+    """Add a table; its position is the middle of its top, ``height`` above the ground."""
+    table, box = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, height]), mujoco.mjtGeom.mjGEOM_BOX
+    top, leg = TOP_THICKNESS / 2, (height - TOP_THICKNESS) / 2
+    size = [TOP_HALF_SIZE, TOP_HALF_SIZE, top]
+    table.add_geom(type=box, size=size, pos=[0, 0, -top], rgba=rgba, contype=TOP_CONTACT, conaffinity=0)
+    place = [0, 0, leg - height]
+    table.add_geom(type=box, size=[0.02, 0.02, leg], pos=place, rgba=rgba, contype=0, conaffinity=0)
+
+
+def add_box(spec: mujoco.MjSpec, height: float) -> None:
+    """Add the box, whose centre is ``height`` above the ground."""
+    box = spec.worldbody.add_body(name="box", pos=[0, 0, height])
+    box.add_freejoint(name="box")
+    box.add_geom(
+        name="box",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[HALF_SIZE] * 3,
+        mass=MASS,
+        rgba=[0.76, 0.6, 0.38, 1],
+        contype=1,
+        conaffinity=1 | TOP_CONTACT,
+    )
+
+
+def add_joint(spec: mujoco.MjSpec, carrier: str) -> None:
+    """Add a switchable joint between ``carrier`` and box, exclude their contact, and sense the gap between them."""
+    body = mujoco.mjtObj.mjOBJ_BODY
+    weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=body, name1=carrier, name2="box", active=False)
+    weld.data[:3] = 0  # the anchor: the origin of the box
+    weld.solimp[:2] = 0.999  # with MuJoCo's default of 0.9 the box sags
+    spec.add_exclude(bodyname1=carrier, bodyname2="box")
+    for index, geom in enumerate(spec.body(carrier).geoms):
+        if geom.conaffinity:
+            geom.name = geom.name or f"{carrier}_{index}"
+            spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_GEOMDIST,
+                objtype=mujoco.mjtObj.mjOBJ_GEOM,
+                objname=geom.name,
+                reftype=mujoco.mjtObj.mjOBJ_GEOM,
+                refname="box",
+                cutoff=0.01,  # wider gaps are all reported as the cutoff
+            )

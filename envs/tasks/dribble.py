@@ -1,0 +1,254 @@
+"""The dribble task: move a ball to a target with the feet."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import mujoco
+import numpy as np
+from torch import Tensor
+
+from torchrl_mcp.envs.characters.mirror import Mirror
+from torchrl_mcp.envs.ideal import Reach, transport_reach
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.tasks.initial_states import InitialStates
+from torchrl_mcp.envs.tasks.rewards import dribble_reward, reward_until_success
+from torchrl_mcp.envs.tasks.transport import (
+    ANY_DIRECTION,
+    SUCCESS_DISTANCE,
+    goal_layout,
+    goal_mirror,
+    goal_of,
+    horizontal_extent,
+    mocap_positions,
+    near,
+    placement,
+    places,
+    pointers,
+    require_transport,
+)
+
+OBJECTS = {"target": 3, "ball": 13}
+"""The objects in the order of the scene: target and ball. How many numbers the goal has of each: position (3),
+orientation (4), linear (3) and angular velocity (3)."""
+
+# Radius, mass, friction and damping of the ball are from the same authors' public code.
+RADIUS = 0.2
+MASS = 0.43
+FRICTION = 0.4
+DAMPING = -math.log(1 - 0.4)
+"""Rate per second at which the ball loses speed and spin: the code's simulator loses a share of 0.4 in a second."""
+STIFFNESS = 12000.0
+"""Stiffness of the ball's contacts, per second squared: it touches the ground for three physics steps of 1/120 s.
+
+A stiffer ball would touch for fewer steps, and its bounce would depend on when within a step it meets the ground.
+"""
+CONTACT_DAMPING = 25.0
+"""Damping of the ball's contacts, per second: it bounces with 0.6 of its speed, like a football on turf.
+
+FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 0.55 to 0.71 of the speed.
+"""
+
+SUCCESS_REACH = 2.0
+"""Largest distance in metres between character and ball for success."""
+
+
+class Dribble(PDCharacterEnv):
+    """A character moves a ball to a target.
+
+    ``goal`` (16) is the position of the target, and position, orientation, linear and angular velocity of the ball, in
+    the character's heading frame, with positions relative to the root; ``goal_layout`` has the names of its entries.
+    ``success`` (1, bool) is whether the ball is at the target, that is, horizontally within 0.5 m, and the character
+    within 2 m of the ball.
+
+    The ball collides with the ground and the whole character, with its own friction. Its damping slows translation and
+    rotation alike, so that it rolls without slipping and its speed falls to 60 % in a second. It bounces like a
+    football.
+
+    The variants of the reward are those of :class:`~torchrl_mcp.envs.Carry`: a ball at rest at the target has a printed
+    reward of at most 0.73. With ``reward_weights`` of a curriculum, training uses
+    :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`, and a success ends the episode.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        object_distances: Range (lo, hi) of the ball's distance from the character, in metres. Paper: 0 to 10; here from
+            0.5, as in the same authors' public code, or from the first distance without contact if that is larger.
+        object_directions: Range (lo, hi) of the direction of the ball, in radians from the character's heading.
+        target_distances: Range (lo, hi) of the target's distance from the ball, in metres.
+        target_directions: Range (lo, hi) of the direction from the ball to the target, in radians from the direction of
+            the ball: 0 is straight beyond the ball.
+        speed: Target speed of character and ball, in m/s. Paper: 1.
+        target_distance_power: Power of the distance between ball and target in the reward: 2 (paper) or 1.
+        success_reward: Set the reward to 1 while successful.
+        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
+            :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
+            3000 are 100 s, as in the same authors' public code.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    Reference:
+        Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
+        appendix D, https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> env = Dribble("biped", num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "goal"].shape
+        torch.Size([2, 3, 16])
+    """
+
+    num_reward_terms = 4
+
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        object_distances: Sequence[float] = (0.5, 10.0),
+        object_directions: Sequence[float] = ANY_DIRECTION,
+        target_distances: Sequence[float] = (0.0, 10.0),
+        target_directions: Sequence[float] = ANY_DIRECTION,
+        speed: float = 1.0,
+        target_distance_power: float = 2,
+        success_reward: bool = False,
+        goal_positions: str = "metres",
+        max_episode_steps: int = 3000,
+        **kwargs: Any,
+    ) -> None:
+        require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
+        self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
+        self.goal_positions, self.goal_layout = goal_positions, goal_layout(OBJECTS)
+        super().__init__(character, num_envs, furnish=add_pitch, max_episode_steps=max_episode_steps, **kwargs)
+        self.initial_states = InitialStates(
+            character, self.curriculum.initial_states, self.curriculum.motions, self.device
+        )
+        self.ranges = placement(
+            self.curriculum.mixture,
+            object_distances=object_distances,
+            object_directions=object_directions,
+            target_distances=target_distances,
+            target_directions=target_directions,
+        )
+        extent = horizontal_extent(
+            self.simulation.model, len(self._bodies), self.initial_states.poses(), 0.0, 2 * RADIUS
+        )
+        self.ranges.keep_clear("object_distances", extent + RADIUS)
+        self.ranges.to(self.device)
+        # Live views, made once.
+        self._marks = mocap_positions(self.simulation.model).to(self.device)
+        self._ball, self._target = self.pose("ball")[0], self.pose("target")[0]
+        self.track(object=self._ball)
+        self.make_specs()
+
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """Ball and target at drawn places around the character."""
+        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        ball, target = places(start["qpos"][:, :2], self.ranges.draw(num, self.generator))
+        start["qpos"][:, -7:-5], marks = ball, self._marks.repeat(num, 1, 1)
+        marks[:, 0, :2] = target
+        return {**start, "mocap_pos": marks}
+
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """State of the character, and where it sees target and ball."""
+        state, objects = self.see(ids)
+        goal = goal_of(objects, OBJECTS, self.goal_positions)
+        return {"observation": state, "goal": goal, "success": self.success()[ids].unsqueeze(-1)}
+
+    def reward(self) -> Tensor:
+        """Reward of appendix D, or 1 while successful."""
+        reward = dribble_reward(*self._motion(), speed=self.speed, target_distance_power=self.target_distance_power)
+        return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
+
+    def training_reward(self) -> Tensor:
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`."""
+        aids, weights = self.curriculum, self.curriculum.reward_weights
+        assert weights is not None
+        power = aids.target_distance_power
+        reward = dribble_reward(*self._motion(), weights=weights, speed=self.speed, target_distance_power=power)
+        return reward_until_success(reward, self.success(), weights=weights, speed=self.speed, discount=aids.discount)
+
+    def terminated(self) -> Tensor:
+        """Whether a success ends the episode, as it does in training with other weights of the reward."""
+        return super().terminated() if self.curriculum.reward_weights is None else self.success()
+
+    def success(self) -> Tensor:
+        """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
+        return near(self._ball, self._target, SUCCESS_DISTANCE) & near(self.com, self._ball, SUCCESS_REACH)
+
+    def reach(self) -> Reach:
+        """Returns of standing still, and of an ideal player that takes the ball straight to its target."""
+        com, _, ball, _, target = self._motion()
+        return transport_reach(
+            partial(dribble_reward, speed=self.speed, target_distance_power=self.target_distance_power),
+            *(place.clone() for place in (com, ball, target)),
+            speed=self.speed,
+            timestep=self.control_timestep,
+            num_steps=self.max_episode_steps,
+            success_distance=SUCCESS_DISTANCE if self.success_reward else 0.0,
+        )
+
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
+        return goal_mirror(OBJECTS)
+
+    def arrows(self, index: int) -> list[Arrow]:
+        """Arrows from above the character to the ball, and from above the ball to the target."""
+        return pointers(self.com[index], self._ball[index], self._target[index])
+
+    def _motion(self) -> tuple[Tensor, ...]:
+        """Horizontal centre of mass, its velocity, place and velocity of the ball, and the target, each ``(N, 2)``."""
+        parts = (self.com, self.velocity("com"), self._ball, self.velocity("object"), self._target)
+        return tuple(part[:, :2] for part in parts)
+
+
+def add_pitch(spec: mujoco.MjSpec) -> None:
+    """Add a target on the ground without collisions, and the ball."""
+    target = spec.worldbody.add_body(name="target", mocap=True)
+    disc, ghost = mujoco.mjtGeom.mjGEOM_CYLINDER, {"contype": 0, "conaffinity": 0}
+    target.add_geom(type=disc, size=[SUCCESS_DISTANCE, 0.002, 0], rgba=[0.9, 0.1, 0.1, 0.5], **ghost)
+    target.add_geom(type=disc, size=[0.03, 0.75, 0], pos=[0, 0, 0.75], rgba=[0.9, 0.1, 0.1, 1], **ghost)
+    add_ball(spec)
+
+
+def add_ball(spec: mujoco.MjSpec) -> None:
+    """Add the ball, solid, at rest on the ground.
+
+    A free joint has one damping for forces and torques. Three slides and a ball joint have the same coordinates but
+    separate damping.
+    """
+    ball = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
+    for name, axis, at in zip("xyz", np.eye(3), ball.pos, strict=True):
+        slide, damping = mujoco.mjtJoint.mjJNT_SLIDE, [MASS * DAMPING, 0, 0]
+        ball.add_joint(name=f"ball_{name}", type=slide, axis=axis, ref=at, damping=damping, armature=0)
+    damping = [0.4 * MASS * RADIUS**2 * DAMPING, 0, 0]
+    ball.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, damping=damping, armature=0)
+    spec.add_texture(
+        name="ball",
+        type=mujoco.mjtTexture.mjTEXTURE_CUBE,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        width=64,
+        height=384,
+        rgb1=[0.95, 0.95, 0.95],
+        rgb2=[0.1, 0.1, 0.1],
+    )
+    material = spec.add_material(name="ball")
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ball"
+    ball.add_geom(
+        name="ball",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[RADIUS, 0, 0],
+        mass=MASS,
+        material="ball",
+        rgba=[1, 1, 1, 1],
+        contype=1,
+        conaffinity=1,
+        friction=[FRICTION, 0, 0],
+        priority=1,  # use the ball's friction and bounce, not the greater friction and the mean softness of both geoms
+        solref=[-STIFFNESS, -CONTACT_DAMPING],
+        solimp=[0.97, 0.97, 0.001, 0.5, 2],
+    )
