@@ -116,6 +116,69 @@ class CharacterEnv(EnvBase):
         self._dtype, self._pin_memory = dtype, pin_memory
         self._camera: tuple[tuple[int, int], Camera] | None = None
 
+    @abstractmethod
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """Draw the states of ``num`` episodes at their beginning, with ``generator``.
+
+        Returns:
+            ``qpos``, ``qvel``, other state fields of the simulation, and entries of ``episode`` that differ from those
+            given to the constructor, each ``(num, ...)``.
+        """
+
+    @abstractmethod
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
+
+        Args:
+            ids: The simulations, as indices ``(n,)`` or the slice of all.
+
+        Returns:
+            Observations, each ``(n, ...)``; live views are allowed.
+        """
+
+    @abstractmethod
+    def reward(self) -> Tensor:
+        """Reward of the step just made, ``(N,)``, float64."""
+
+    def after_step(self, diverged: Tensor) -> None:
+        """Change what a step calls for, right after it: a weld that closes, say, or measurements in ``episode``.
+
+        Args:
+            diverged: Simulations that did not move, shape ``(n,)``; their rewards are ignored.
+        """
+
+    def terminated(self) -> Tensor:
+        """Whether the step just made ended the episode, by failure or success, ``(N,)``: by default it did not."""
+        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def truncated(self) -> Tensor:
+        """Whether the episode is cut short for a reason other than the time limit, ``(N,)``: by default it is not."""
+        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def update_goal(self) -> None:
+        """Change the goal after the reward of a step, for the next action: a direction that wanders, say."""
+
+    def normalised_return(self, episode_return: Tensor) -> Tensor:
+        r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
+
+        :math:`R` is the undiscounted return and :math:`T` ``max_episode_steps``, for rewards from 0 to 1. The paper's
+        normalisation is not documented.
+        """
+        return episode_return / self.max_episode_steps
+
+    def track(self, **places: Tensor) -> None:
+        """Keep the values of live views from before each step in ``episode``, for :meth:`velocity`.
+
+        Args:
+            **places: Live views of positions in metres by name, each ``(N, D)``.
+        """
+        self._tracked |= places
+        self.episode |= {name: place.to(torch.float64, copy=True) for name, place in places.items()}
+
+    def velocity(self, name: str) -> Tensor:
+        """Mean velocity of a tracked place in the last step, in m/s, ``(N, D)``, float64."""
+        return (self._tracked[name] - self.episode[name]) / self.control_timestep
+
     @classmethod
     def characters(cls) -> tuple[str, ...]:
         """Return the names of the characters that can do the task; empty for no restriction."""
@@ -133,14 +196,6 @@ class CharacterEnv(EnvBase):
             f"{type(self).__name__} has no mirror image, which symmetry needs: pass symmetry=none, or a task of biped, "
             "humanoid or T-Rex"
         )
-
-    def normalised_return(self, episode_return: Tensor) -> Tensor:
-        r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
-
-        :math:`R` is the undiscounted return and :math:`T` ``max_episode_steps``, for rewards from 0 to 1. The paper's
-        normalisation is not documented.
-        """
-        return episode_return / self.max_episode_steps
 
     def reach(self) -> Reach | None:
         """Returns of standing still and of an ideal player in the episodes just begun, None if the task has none."""
@@ -337,61 +392,6 @@ class CharacterEnv(EnvBase):
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward of the step (float64) and whether it ended the episode, ``(N,)`` each."""
         return self.reward(), self.terminated()
-
-    def track(self, **places: Tensor) -> None:
-        """Keep the values of live views from before each step in ``episode``, for :meth:`velocity`.
-
-        Args:
-            **places: Live views of positions in metres by name, each ``(N, D)``.
-        """
-        self._tracked |= places
-        self.episode |= {name: place.to(torch.float64, copy=True) for name, place in places.items()}
-
-    def velocity(self, name: str) -> Tensor:
-        """Mean velocity of a tracked place in the last step, in m/s, ``(N, D)``, float64."""
-        return (self._tracked[name] - self.episode[name]) / self.control_timestep
-
-    @abstractmethod
-    def initial_state(self, num: int) -> dict[str, Tensor]:
-        """Draw the states of ``num`` episodes at their beginning, with ``generator``.
-
-        Returns:
-            ``qpos``, ``qvel``, other state fields of the simulation, and entries of ``episode`` that differ from those
-            given to the constructor, each ``(num, ...)``.
-        """
-
-    @abstractmethod
-    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
-
-        Args:
-            ids: The simulations, as indices ``(n,)`` or the slice of all.
-
-        Returns:
-            Observations, each ``(n, ...)``; live views are allowed.
-        """
-
-    @abstractmethod
-    def reward(self) -> Tensor:
-        """Reward of the step just made, ``(N,)``, float64."""
-
-    def after_step(self, diverged: Tensor) -> None:
-        """Change what a step calls for, right after it: a weld that closes, say, or measurements in ``episode``.
-
-        Args:
-            diverged: Simulations that did not move, shape ``(n,)``; their rewards are ignored.
-        """
-
-    def terminated(self) -> Tensor:
-        """Whether the step just made ended the episode, by failure or success, ``(N,)``: by default it did not."""
-        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-
-    def truncated(self) -> Tensor:
-        """Whether the episode is cut short for a reason other than the time limit, ``(N,)``: by default it is not."""
-        return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-
-    def update_goal(self) -> None:
-        """Change the goal after the reward of a step, for the next action: a direction that wanders, say."""
 
     @property
     def metric_names(self) -> dict[str, list[str]]:

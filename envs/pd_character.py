@@ -211,8 +211,8 @@ class PDCharacterEnv(CharacterEnv):
         centres, trees = self._centres
         seen = (*(part[rows] for part in self._seen), centres[rows][:, trees])
         positions, orientations, twists, centres = map(by_component, seen)
-        angular = contiguous(twists[:, :3])
-        linear = origin_velocities(angular, twists[:, 3:], contiguous(positions - centres))
+        positions, angular = contiguous(positions), contiguous(twists[:, :3])
+        linear = origin_velocities(angular, twists[:, 3:], positions - centres)
         parts = (positions, orientations, linear, angular)
         return BodyStates(*(converted(part, self._dtype).permute(2, 0, 1) for part in parts))
 

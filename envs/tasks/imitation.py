@@ -131,7 +131,9 @@ class Imitation(PDCharacterEnv):
             "error": torch.zeros((), dtype=torch.float64),
             "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
-        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
+        super().__init__(
+            character, num_envs, max_episode_steps=max_episode_steps, episode=reference, curriculum=None, **kwargs
+        )
         self.library, self._layout = library.to(self.device), joint_layout(character).to(self.device)
         self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
         ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)

@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.training import checkpoint, collectors
-from torchrl_mcp.training.collectors import LocalSource, RemoteSource
+from torchrl_mcp.training.collectors import Batches, LocalSource, RemoteSource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads
@@ -125,7 +125,7 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     product(source.env.reset())
     policy, watch = TensorDictSequential(build.make_agent(cfg, source.env).actor.policy, product), Stopwatch()
     with threads(3):  # the learner's, which workers do not diminish
-        source.start(policy, frames_per_batch=80, device=torch.device("cpu"), autocast=True, stopwatch=watch)
+        source.start(policy, Batches(80, torch.device("cpu"), autocast=True, stopwatch=watch))
         batch = source.collect()
         during = torch.get_num_threads()
         source.stop()

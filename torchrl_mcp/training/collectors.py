@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol
@@ -26,6 +27,23 @@ PATIENCE = 5.0
 """Seconds after which workers that have not ended are killed."""
 
 
+@dataclass(frozen=True)
+class Batches:
+    """How trajectories are collected.
+
+    Args:
+        frames: Steps ``N * T`` of a batch.
+        device: Device of the policy and of the trajectories.
+        autocast: Whether the policy computes in bfloat16.
+        stopwatch: What measures the time.
+    """
+
+    frames: int
+    device: torch.device
+    autocast: bool
+    stopwatch: Stopwatch
+
+
 class TrajectorySource(Protocol):
     """The interface of trajectory sources.
 
@@ -39,16 +57,8 @@ class TrajectorySource(Protocol):
     num_envs: int
     resumes_episodes: bool
 
-    def start(
-        self,
-        policy: TensorDictModuleBase,
-        *,
-        frames_per_batch: int,
-        device: torch.device,
-        autocast: bool,
-        stopwatch: Stopwatch,
-    ) -> None:
-        """Prepare collection with ``policy``, in batches of ``N * T = frames_per_batch`` steps."""
+    def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
+        """Prepare collection with ``policy``."""
         ...
 
     def collect(self) -> TensorDictBase:
@@ -87,24 +97,16 @@ class LocalSource:
         self.env = env
         self.num_envs: int = env.batch_size[0]
 
-    def start(
-        self,
-        policy: TensorDictModuleBase,
-        *,
-        frames_per_batch: int,
-        device: torch.device,
-        autocast: bool,
-        stopwatch: Stopwatch,
-    ) -> None:
+    def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
         """Set up TorchRL's collector."""
-        self._stopwatch = stopwatch
-        self._precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=autocast)
-        stopwatch.watch("forward", policy)
+        device, self._stopwatch = batches.device, batches.stopwatch
+        self._precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=batches.autocast)
+        self._stopwatch.watch("forward", policy)
         random = GlobalRNGState().state_dict()
         self._collector = Collector(
             self.env,
             policy,
-            frames_per_batch=frames_per_batch,
+            frames_per_batch=batches.frames,
             total_frames=-1,
             env_device=self.env.device,
             policy_device=device,
@@ -196,17 +198,9 @@ class RemoteSource:
         self._backend = {"backend": backend, "backend_options": dict(backend_options or {})}
         self._starts = 0
 
-    def start(
-        self,
-        policy: TensorDictModuleBase,
-        *,
-        frames_per_batch: int,
-        device: torch.device,
-        autocast: bool,
-        stopwatch: Stopwatch,
-    ) -> None:
+    def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
         """Start the workers."""
-        self._stopwatch, self._device, self._steps = stopwatch, device, frames_per_batch // self.num_envs
+        self._stopwatch, self._device, self._steps = batches.stopwatch, batches.device, batches.frames // self.num_envs
         seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
         self._starts += 1
         random = GlobalRNGState().state_dict()
@@ -217,14 +211,14 @@ class RemoteSource:
         with threads_kept(), new_workers() as self._workers:
             self._collector = Collector(
                 [partial(self._make_env, seed=int(seed)) for seed in seeds],
-                _Autocast(policy, device) if autocast else policy,
+                _Autocast(policy, batches.device) if batches.autocast else policy,
                 num_collectors=self.num_workers,
                 sync=True,
-                frames_per_batch=frames_per_batch,
-                total_frames=frames_per_batch * 10**9,  # not all backends support endless collection
+                frames_per_batch=batches.frames,
+                total_frames=batches.frames * 10**9,  # not all backends support endless collection
                 env_device="cpu",
-                policy_device=device,
-                storing_device=device,
+                policy_device=batches.device,
+                storing_device=batches.device,
                 **self._backend,
             )
         GlobalRNGState().load_state_dict(random)

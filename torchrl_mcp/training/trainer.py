@@ -21,7 +21,7 @@ from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.checkpoint import RunRandomness, load, run_checkpoint, save
-from torchrl_mcp.training.collectors import TrajectorySource
+from torchrl_mcp.training.collectors import Batches, TrajectorySource
 from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.episodes import EpisodeStatistics
 from torchrl_mcp.training.metrics import MetricsWriter
@@ -133,13 +133,8 @@ class Trainer:
 
     def run(self) -> None:
         """Train until ``total_frames``, with checkpoints."""
-        self.source.start(
-            self._behaviour(),
-            frames_per_batch=self.frames_per_batch,
-            device=self.device,
-            autocast=self.autocast,
-            stopwatch=self.stopwatch,
-        )
+        batches = Batches(self.frames_per_batch, self.device, self.autocast, self.stopwatch)
+        self.source.start(self._behaviour(), batches)
         try:
             self._loop()
         finally:
