@@ -35,16 +35,18 @@ def test_every_choice_of_every_group_composes(choices):
 
 
 @pytest.mark.parametrize(
-    ("task", "practice", "mixture"),
-    [("holdout", "emphasis", 0), ("dribble", "emphasis", 3), ("carry", "printed", 0)],
+    ("task", "curriculum", "mixture"),
+    [("holdout", "mixed", 0), ("dribble", "mixed", 3), ("carry", "none", 0)],
 )
-def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, practice, mixture):
-    arguments = [f"task={task}", f"practice={practice}", "stage=transfer", "--cfg", "job", "--resolve"]
+def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, curriculum, mixture):
+    arguments = [f"task={task}", f"curriculum={curriculum}", "stage=transfer", "--cfg", "job", "--resolve"]
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
     main()
     printed = yaml.safe_load(capsys.readouterr().out)
-    assert len((printed["practice"]["curriculum"] or {}).get("mixture", [])) == mixture
-    assert printed["run_dir"] == f"runs/{task}-{printed['character']['name']}/transfer/mcp/practice-{practice}/seed0"
+    assert len((printed["curriculum"]["aids"] or {}).get("mixture", [])) == mixture
+    assert (
+        printed["run_dir"] == f"runs/{task}-{printed['character']['name']}/transfer/mcp/curriculum-{curriculum}/seed0"
+    )
 
 
 @pytest.mark.parametrize("words", [["--cfg", "hydra"], ["-c", "hydra"], ["--cfg=hydra"]])

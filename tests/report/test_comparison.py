@@ -168,15 +168,15 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     runs = {"plain": evaluated, "practised": trained}
     plain, practised = grouped(
         *(
-            write_run(name, practice__name=name, task__transfer=use, task__evaluation=evaluated)
+            write_run(name, curriculum__name=name, task__transfer=use, task__evaluation=evaluated)
             for name, use in runs.items()
         )
     )
-    assert [cell.settings for cell in (plain, practised)] == [{"practice": "plain"}, {"practice": "practised"}]
+    assert [cell.settings for cell in (plain, practised)] == [{"curriculum": "plain"}, {"curriculum": "practised"}]
     assert not any(remark.startswith("trained with") for remark in plain.remarks)
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
-        "trained with practice=practised: curriculum.initial_states.rest=0.2, "
+        "trained with curriculum=practised: curriculum.initial_states.rest=0.2, "
         "curriculum.initial_states.motions=0.8, curriculum.mixture=[{'weight': 2}]"
     )
 
@@ -236,7 +236,7 @@ def test_methods_have_colours_of_their_own_those_of_table_2_first(write_run):
         ("num_primitives", "num_primitives", [4, 8, 16]),
         ("mixer", "mixer__name", ["additive", "multiplicative"]),
         ("exploration", "exploration__name", ["action", "weights"]),
-        ("practice", "practice__name", ["emphasis", "printed"]),
+        ("curriculum", "curriculum__name", ["mixed", "none"]),
     ],
 )
 def test_an_ablation_holds_the_cells_that_differ_in_its_setting_alone(write_mcp, write_run, setting, key, values):

@@ -149,17 +149,17 @@ def test_what_training_uses_would_make_another_evaluation(task):
 @pytest.mark.parametrize("character", ["humanoid", "trex"])
 @pytest.mark.parametrize("task", ["carry", "dribble"])
 def test_near_objects_of_training_are_clear_of_every_character(task, character):
-    cfg = configure(task, f"character={character}", "practice=emphasis")
+    cfg = configure(task, f"character={character}", "curriculum=mixed")
     build.make_env(cfg, num_envs=2, seed=0).reset()
 
 
-@pytest.mark.parametrize("practice", ["printed", "emphasis"])
+@pytest.mark.parametrize("curriculum", ["none", "mixed"])
 @pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
-def test_every_practice_makes_environments_that_begin_and_are_evaluated_alike(task, practice):
-    cfg = configure(task, f"practice={practice}")
+def test_every_curriculum_makes_environments_that_begin_and_are_evaluated_alike(task, curriculum):
+    cfg = configure(task, f"curriculum={curriculum}")
     assert evaluated_as(cfg) == evaluated_as(configure(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
-    another = practice == "emphasis" and task != "heading"
+    another = curriculum == "mixed" and task != "heading"
     assert ("task_reward" in env.rollout(2)["next"]) == another
 
 

@@ -22,7 +22,7 @@ def test_every_level_of_a_run_folder_is_in_its_path():
 
 
 @pytest.mark.parametrize(
-    "settings", [UNNAMED, UNLEARNT - {"task.evaluation", "task.practice"}], ids=["unnamed", "unlearnt"]
+    "settings", [UNNAMED, UNLEARNT - {"task.evaluation", "task.curriculum"}], ids=["unnamed", "unlearnt"]
 )
 def test_every_setting_that_is_named_exists(settings):
     for name in settings:

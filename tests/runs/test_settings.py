@@ -132,6 +132,7 @@ WITHOUT_RULE = {
     *("primitives", "mixer", "trained", "dim", "interval", "explorer", "environment", "schedule", "mixture"),
     *("logger_name", "logger_type", "experiment_name", "backend", "address", "include_dashboard", "log_to_driver"),
     *("num_cpus", "num_gpus", "memory", "distribution_class", "gate_activation", "transforms", "benchmark", "logger"),
+    "aids",
     "curriculum",
 }
 """Names, what other groups make, and what TorchRL, Ray and the loggers check."""

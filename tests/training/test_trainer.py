@@ -278,7 +278,7 @@ def test_finetuning_begins_with_the_noise_of_the_task_and_not_with_that_of_imita
 
 
 def test_metrics_are_means_over_the_episodes_that_ended_and_over_all_steps(tmp_path):
-    settings = ["method=scratch", "task=dribble", "character=biped", "practice=printed"]
+    settings = ["method=scratch", "task=dribble", "character=biped", "curriculum=none"]
     cfg = configure(tmp_path, *settings, "task.transfer.max_episode_steps=5", "++task.transfer.terminate_on_fall=false")
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, tmp_path)

@@ -12,7 +12,7 @@ end_with_parent_while_starting()  # before the imports that take a worker second
 PROGRAM = "torchrl-mcp-train"
 
 GROUPS = (
-    *("method", "task", "character", "stage", "motions", "imitation", "practice", "preset", "benchmark"),
+    *("method", "task", "character", "stage", "motions", "imitation", "curriculum", "preset", "benchmark"),
     *("mixer", "gating", "primitives", "exploration", "optimizer", "collector", "logger"),
 )
 """Groups of settings for the command line; the choices of other groups come with a method."""

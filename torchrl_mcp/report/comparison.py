@@ -133,7 +133,7 @@ class Cell:
             *(["one seed: the interval is over its episodes"] if len(self.complete) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(f"mixed {found}" for found in _mixed("evaluations", _protocols(self.complete))),
-            *(f"trained with practice={self.choices['practice']}: {used}" for used in self.runs[0].practice),
+            *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),
         ]
 
 
@@ -167,7 +167,7 @@ def choices(run: Run) -> dict[str, Any]:
         "trained": trained if transfers else None,
         "mixer": settings.get("mixer.name"),
         "exploration": settings.get("exploration.name") if _explores(run) else None,
-        "practice": settings.get("practice.name") if run.stage == "transfer" else None,
+        "curriculum": run.curriculum_name if run.stage == "transfer" else None,
         "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
     }
     return named | {name: settings.get(name) for name in run.standard if name not in named}

@@ -133,7 +133,12 @@ class Run:
         return self.provenance.get("commit") or "unknown"
 
     @property
-    def practice(self) -> list[str]:
+    def curriculum_name(self) -> str | None:
+        """Choice of the group ``curriculum``, which older versions called ``practice``."""
+        return self.settings.get("curriculum.name", self.settings.get("practice.name"))
+
+    @property
+    def curriculum(self) -> list[str]:
         """Settings of the environment that differ between transfer and evaluation, as one line or none."""
         if self.stage != "transfer":
             return []

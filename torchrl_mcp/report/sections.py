@@ -26,8 +26,8 @@ ABLATIONS = {
     "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper: similar returns on most tasks."),
     "mixer": ("Mixer", "Multiplicative composition of primitives (Eq. 3), or additive (Eq. 1)."),
     "exploration": ("Exploration", "Over actions (Eq. 4), or over the weights of primitives (Section 5.3)."),
-    "practice": (
-        "Practice",
+    "curriculum": (
+        "Curriculum",
         "Episodes and rewards of training that differ from the paper's. Evaluations have the paper's.",
     ),
 }
@@ -41,7 +41,7 @@ SETTING_WORDS = {
     "trained": "trained: {}",
     "mixer": "{} mixer",
     "exploration": "exploration: {}",
-    "practice": "practice: {}",
+    "curriculum": "curriculum: {}",
     "pretrained": "{} pre-training",
 }
 

@@ -24,7 +24,7 @@ UNNAMED = CONDUCT | PLACES | {*LEVELS, "autocast", "evaluation.episodes", "evalu
 """Settings that are not in the name of a run folder: ``exclude_keys`` of ``conf/train.yaml``."""
 
 ENVIRONMENTS = frozenset(
-    {"benchmark", "evaluation", "imitation", "motions", "practice", "task.evaluation", "task.practice"}
+    {"benchmark", "evaluation", "imitation", "motions", "curriculum", "task.evaluation", "task.curriculum"}
 )
 """Settings that do not affect training, or environments of some stages only; ``task`` holds those of the stage."""
 
@@ -32,7 +32,7 @@ UNLEARNT = CONDUCT | PLACES | ENVIRONMENTS | {"autocast", "seed"}
 """Settings that are ignored when results are compared: runs that differ only in them are averaged."""
 
 TRANSFER_ONLY = frozenset(
-    {"budget.scratch", "budget.transfer", "exploration", "practice", "pretrained", "transfer.freeze", "transfer.keep"}
+    {"budget.scratch", "budget.transfer", "exploration", "curriculum", "pretrained", "transfer.freeze", "transfer.keep"}
 )
 """Settings that pre-training ignores or refuses."""
 

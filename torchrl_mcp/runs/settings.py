@@ -65,11 +65,11 @@ RANGE = Rule(
 
 NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
-        num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor checkpoint_interval
-        keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options latent_dim
-        steps_per_choice explorer.steps
+        num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor lengths.none lengths.mixed
+        checkpoint_interval keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options
+        latent_dim steps_per_choice explorer.steps
     """,
-    COUNT.or_null(): "torch_threads record_interval practice.max_episode_steps",
+    COUNT.or_null(): "torch_threads record_interval",
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
     SEED: "seed",
     POSITIVE: """
@@ -85,14 +85,14 @@ NAMES_BY_RULE: dict[Rule, str] = {
     DISCOUNT: "gamma",
     SHARE: """
         lmbda discount epsilon momentum terminations.initial initial_states.rest
-        initial_states.motions beginnings_in_motion
+        initial_states.motions motion_starts
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
         terminate_when_unhealthy success_reward parts.blind random_first_length restart_noise
     """,
     RANGE: """
-        healthy_z_range initial_directions near_objects object_distances
+        healthy_z_range initial_directions near_objects near object_distances
         object_directions target_distances target_directions
         evaluation.directions environment.directions directions.pretrain directions.transfer pretrain.directions
         transfer.directions
