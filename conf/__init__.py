@@ -5,3 +5,10 @@ if __name__ != "torchrl_mcp.conf":
         "import torchrl_mcp.conf, not conf: this folder is a part of the torchrl_mcp package "
         "(install it with `pip install -e .` and use the full name)"
     )
+
+from omegaconf import OmegaConf
+
+from torchrl_mcp.runs.identity import folder_name
+
+# Hydra imports this package to read its files, so the resolver is there wherever they are.
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)

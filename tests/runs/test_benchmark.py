@@ -63,8 +63,6 @@ def copy(finished, tmp_path):
     """The finished benchmark elsewhere: what to change and run again."""
     root = tmp_path / "runs"
     shutil.copytree(finished, root)
-    for path in root.rglob("config.yaml"):
-        path.write_text(path.read_text().replace(str(finished), str(root)))
     return root
 
 
@@ -235,6 +233,24 @@ def test_a_benchmark_goes_on_where_it_was_interrupted(copy, finished):
     assert times(scratch) == untouched
 
 
+def test_a_benchmark_is_the_same_wherever_it_is_and_however_its_place_is_written(copy, monkeypatch, capsys):
+    before = times(copy)
+    monkeypatch.chdir(copy.parent)
+    smoke("./runs/")  # the finished one, in another folder
+    assert "all 3 runs are complete" in capsys.readouterr().out
+    assert times(copy) == before
+
+
+def test_a_pretraining_with_other_networks_makes_another_run(copy, finished):
+    pretraining, transfer, _ = folders(copy)
+    first, last = sorted((pretraining / "checkpoints").iterdir())
+    shutil.copyfile(first, last)  # as if it had not learnt
+    before = times(copy)
+    with pytest.raises(ValueError, match=f"{transfer} differs in pretrained: keep it"):
+        smoke(copy)
+    assert times(copy) == before
+
+
 def test_a_failed_run_is_named_with_its_log_and_stops_only_what_needs_it(copy):
     pretraining, transfer, scratch = folders(copy)
     (pretraining / "evaluation.json").unlink()
@@ -258,7 +274,7 @@ def test_a_failed_run_is_named_with_its_log_and_stops_only_what_needs_it(copy):
 def test_a_folder_of_other_settings_is_not_taken_for_done(copy):
     before = times(copy)
     other = not OmegaConf.load(folders(copy)[0] / "config.yaml").autocast  # than the machine's own choice
-    with pytest.raises(ValueError, match="differs in autocast: delete it") as error:
+    with pytest.raises(ValueError, match="differs in autocast: keep it") as error:
         smoke(copy, f"autocast={other}")
     assert all(str(run) in str(error.value) for run in folders(copy))
     assert times(copy) == before

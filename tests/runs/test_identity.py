@@ -36,7 +36,7 @@ def test_a_run_goes_on_with_another_conduct_but_with_no_other_setting():
     assert differences(held, held) == []
     for name in held:
         found = differences(held, {**held, name: 1})
-        assert found == ([] if name in CONDUCT else [name])
+        assert found == ([] if name in CONDUCT | PLACES else [name])
 
 
 def test_a_setting_that_only_one_of_two_has_makes_them_differ():

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
+from torchrl_mcp.cli.parsing import add_task, add_trust, announce, new_parser, task_settings
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
 
@@ -27,8 +27,10 @@ def main() -> None:
         from torchrl_mcp.runs.trust import trusting
 
         with trusting(arguments.trust):
-            clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed) if arguments.clips else []
-            results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed)
+            settings = task_settings(arguments.task)
+            alone = {"episodes": arguments.clips, "seed": arguments.seed, **settings}
+            clips = evaluate_clips(path, **alone) if arguments.clips else []
+            results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed, **settings)
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
     report(arguments, results, [asdict(clip) for clip in clips])
@@ -77,6 +79,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--clips", type=int, metavar="N", help="imitation only: follow each reference motion alone, in N episodes"
     )
+    add_task(parser)
     add_trust(parser)
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file as well")
     return parser

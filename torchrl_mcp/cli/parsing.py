@@ -3,6 +3,12 @@
 import argparse
 import os
 import sys
+import textwrap
+from collections.abc import Iterator
+from importlib.resources import files
+from typing import Any, cast
+
+import yaml  # type: ignore[import-untyped]
 
 from torchrl_mcp import __version__
 
@@ -59,6 +65,36 @@ def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
         else:
             others.append(word)
     return trusted, others
+
+
+def add_task(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--task``, and list its keys below the options."""
+    parser.add_argument(
+        "--task",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="an argument of the task, see below; repeatable",
+    )
+    lines = [f"{task}: {', '.join(names)}" for task, names in _task_arguments()]
+    listed = "\n".join(textwrap.fill(line, 110, initial_indent="  ", subsequent_indent="    ") for line in lines)
+    parser.epilog = f"arguments of the tasks (--task):\n{listed}\n\n{parser.epilog or ''}"
+
+
+def task_settings(words: list[str]) -> dict[str, Any]:
+    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
+    from omegaconf import OmegaConf
+
+    if lost := [word for word in words if "=" not in word]:
+        raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
+    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
+
+
+def _task_arguments() -> Iterator[tuple[str, list[str]]]:
+    """Yield each task with its arguments, from its evaluation in ``conf/task``."""
+    for file in sorted(files("torchrl_mcp.conf").joinpath("task").iterdir(), key=lambda file: file.name):
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        yield content["name"], sorted(content["evaluation"])
 
 
 def announce(program: str) -> None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_task, add_trust, announce, find_own_modules, new_parser
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.viewer.formats import require_format
 
@@ -74,9 +74,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of environment and sampling (default 0)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions (default: deterministic)")
-    parser.add_argument(
-        "--task", action="append", default=[], metavar="KEY=VALUE", help="an argument of the task; repeatable"
-    )
+    add_task(parser)
     parser.add_argument(
         "--ghost-distance",
         type=float,

@@ -3,13 +3,13 @@
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
+from torchrl_mcp.cli.parsing import task_settings
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
@@ -76,11 +76,8 @@ def show(
 
 def _restored(arguments: argparse.Namespace) -> tuple[Agent, CharacterEnv]:
     """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
-    path, settings = locate(arguments.checkpoint), _task_settings(arguments)
-    try:
-        _, agent, env = policies.restore(path, num_envs=1, seed=arguments.seed, **settings)
-    except TypeError as error:
-        raise ValueError(f"--task {' '.join(arguments.task)}: {error}") from error
+    settings = task_settings(arguments.task)
+    _, agent, env = policies.restore(locate(arguments.checkpoint), num_envs=1, seed=arguments.seed, **settings)
     return agent, env
 
 
@@ -93,12 +90,7 @@ def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Charact
             cfg = build.compose_run(*own, *arguments.settings, "stage=transfer")
     except HydraException as error:
         raise ValueError(str(error)) from error
-    env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **_task_settings(arguments))
+    env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **task_settings(arguments.task))
     act = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[arguments.agent]
     policy = TensorDictModule(lambda observation: act(), in_keys=["observation"], out_keys=["action"])
     return policy, env
-
-
-def _task_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of the task that ``--task`` replaces."""
-    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(arguments.task)))

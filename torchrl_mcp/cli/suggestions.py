@@ -1,17 +1,54 @@
-"""Suggestions for unknown settings on a command line."""
+"""Answers to mistakes on a command line that Hydra cannot compose."""
 
 import difflib
+import shlex
+from collections.abc import Sequence
 
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.runs.quoting import setting
 
-def suggestions(arguments: list[str]) -> list[str]:
-    """Return a line for each argument ``key=value`` with an unknown key, with the nearest known keys."""
+EXTRAS = {"joblib": "launchers", "submitit": "launchers", "ray": "ray-launcher", "optuna": "optuna"}
+"""Extras of the library with a plugin of Hydra, by the beginning of the plugin's name."""
+
+
+def answer(error: HydraException, words: Sequence[str], *, multirun: bool) -> str:
+    """Return what is wrong with a command line and how to write it, a line for each mistake.
+
+    Args:
+        error: The exception of Hydra.
+        words: The command line.
+        multirun: Whether settings may have several values.
+    """
+    settings = [word for word in words if not word.startswith("-")]
+    lines = unreadable(settings) or ([] if multirun else swept(settings)) or suggestions(settings)
+    if not lines and isinstance(error, MissingConfigException):
+        lines = [_missing(error)]
+    return "\n".join(lines) or "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def unreadable(settings: Sequence[str]) -> list[str]:
+    """Return a line for each setting that Hydra cannot read, with quotes if they help."""
+    return [_quote(word) for word in settings if "=" in word and not _is_readable(word)]
+
+
+def swept(settings: Sequence[str]) -> list[str]:
+    """Return a line for each setting with several values."""
+    overrides = OverridesParser.create().parse_overrides(list(settings))
+    return [
+        f"{override.input_line} has several values: add --multirun to train with each"
+        for override in overrides
+        if override.is_sweep_override()
+    ]
+
+
+def suggestions(settings: Sequence[str]) -> list[str]:
+    """Return a line for each setting ``key=value`` with an unknown key, with the nearest known keys."""
     try:
-        overrides = OverridesParser.create().parse_overrides([a for a in arguments if not a.startswith("-")])
+        overrides = OverridesParser.create().parse_overrides(list(settings))
         with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
             groups = list(compose("train", return_hydra_config=True).hydra.runtime.choices)
             # Methods and presets add settings.
@@ -19,15 +56,43 @@ def suggestions(arguments: list[str]) -> list[str]:
             cfg = compose("train", chosen, return_hydra_config=True)
     except HydraException:
         return []
-    settings = _keys(OmegaConf.to_container(cfg))
-    unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *settings} and not o.is_add()]
+    known = _keys(OmegaConf.to_container(cfg))
+    unknown = [o.key_or_group for o in overrides if o.key_or_group not in {*groups, *known} and not o.is_add()]
     return [
         f"{key!r} is in no file, but is a valid argument: write it with a plus, +{key}=..."
         if _is_argument(key, cfg)
         else f"{key!r} is no setting of this method; the nearest are: "
-        + ", ".join(difflib.get_close_matches(key, {*groups, *settings}, n=3, cutoff=0.5) or sorted(groups))
+        + ", ".join(difflib.get_close_matches(key, {*groups, *known}, n=3, cutoff=0.5) or sorted(groups))
         for key in unknown
     ]
+
+
+def _is_readable(word: str) -> bool:
+    try:
+        OverridesParser.create().parse_overrides([word])
+    except HydraException:
+        return False
+    return True
+
+
+def _quote(word: str) -> str:
+    name, _, value = word.partition("=")
+    quoted = setting(name, value)
+    if quoted == word or not _is_readable(quoted):
+        return f"Hydra cannot read {word}"
+    return f"Hydra cannot read {word} without quotes: write {shlex.quote(quoted)}"
+
+
+def _missing(error: MissingConfigException) -> str:
+    """Return a line about a choice that its group does not have."""
+    group, _, choice = str(error.missing_cfg_file).rpartition("/")
+    extra = next((EXTRAS[name] for name in EXTRAS if choice.startswith(name)), None)
+    if group in ("hydra/launcher", "hydra/sweeper") and extra:
+        return f"{group}={choice} needs a plugin of Hydra: pip install 'torchrl-mcp[{extra}]'"
+    options = list(error.options or [])
+    near = difflib.get_close_matches(choice, options, n=1, cutoff=0.5)
+    meant = f"did you mean {near[0]}? " if near else ""
+    return f"there is no {group}={choice}: {meant}The choices are {', '.join(options)}"
 
 
 def _is_argument(key: str, cfg: DictConfig) -> bool:

@@ -8,13 +8,14 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.report.paper import TABLE_2
+from torchrl_mcp.runs import quoting
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics
 
 
 def summary(folder: Path) -> str:
     """Return the summary of the run in a folder: returns beside the paper's, and the next commands."""
     lines = [f"run folder: {folder}", *_returns(folder), "next:"]
-    lines += [f"  torchrl-mcp-{command}" for command in (f"play {folder}", f"evaluate {folder}", f"report {folder}")]
+    lines += [f"  {quoting.command(name, folder)}" for name in ("play", "evaluate", "report")]
     return "\n".join(lines)
 
 

@@ -21,7 +21,7 @@ SETTINGS = {
     "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
     "seed=N": "seed of networks, environments and sampling (default 0)",
     "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
-    "resume=FOLDER": "run folder to continue; takes no other setting than device",
+    "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to make it longer",
     "training.total_frames=N": "environment steps",
     "device=cuda": "networks on a GPU; physics stays on the CPU",
     "physics=warp": "with device=cuda, physics on the GPU as well, by the extra torchrl-mcp[warp]",
@@ -32,17 +32,20 @@ examples:
   {PROGRAM} method=scratch task=heading character=biped
   {PROGRAM} method=mcp task=heading character=humanoid stage=transfer pretrained=builtin
   {PROGRAM} --multirun method=scratch task=holdout stage=transfer seed=0,1,2
+  {PROGRAM} --multirun method=scratch task=heading seed=0,1 hydra/launcher=joblib hydra.launcher.n_jobs=2
   {PROGRAM} benchmark=smoke
   {PROGRAM} task=heading method=scratch --cfg job        # every setting and its value
 """
 
 
 def main() -> None:
-    """Run the command line; if it names an unknown setting, suggest similar names."""
+    """Run the command line; if Hydra cannot compose it, say what to write instead."""
     trusted, words = take_trust(sys.argv[1:])
     if own := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(own))
-    from torchrl_mcp.cli.suggestions import suggestions
+    from hydra.errors import HydraException
+
+    from torchrl_mcp.cli.suggestions import answer
     from torchrl_mcp.cli.training import run, run_benchmark
     from torchrl_mcp.runs.trust import trusting
 
@@ -54,10 +57,16 @@ def main() -> None:
     try:
         with trusting(trusted):
             run_benchmark(arguments) if is_benchmark else run()
-    except SystemExit as stop:
-        if stop.code == 1:
-            print(*suggestions(words), sep="\n", file=sys.stderr)
-        raise
+    except HydraException as error:
+        sys.exit(f"{PROGRAM}: {answer(error, words, multirun=is_benchmark or arguments != words)}")
+    except ValueError as error:  # of a sweeper, such as Optuna without a completed trial
+        sys.exit(f"{PROGRAM}: {error}")
+    except AttributeError:
+        if __debug__:
+            raise
+        sys.exit(
+            f"{PROGRAM}: Hydra cannot read ranges and choices without assertions: unset PYTHONOPTIMIZE, or drop -O"
+        )
 
 
 def parser() -> argparse.ArgumentParser:
@@ -92,10 +101,19 @@ def choices(group: str) -> list[str]:
     return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml") and name != "base.yaml")
 
 
+SWEEPS = """\
+sweeps:
+  --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. Repeated, it skips complete runs,
+  continues the others, and tries failed ones again.
+  hydra/launcher=joblib or submitit_local: several at a time; slurm: on a cluster (pip install 'torchrl-mcp[launchers]')
+  hydra/launcher=ray_local or ray: by Ray (pip install 'torchrl-mcp[ray-launcher]')
+  hydra/sweeper=optuna: search for the best return (pip install 'torchrl-mcp[optuna]')"""
+
+
 def _epilog() -> str:
     groups = [f"  {group:13}{', '.join(choices(group))}" for group in GROUPS]
     settings = [f"  {setting:25}{meaning}" for setting, meaning in SETTINGS.items()]
-    return "\n".join(["choices:", *groups, "", "settings:", *settings, "", EXAMPLES])
+    return "\n".join(["choices:", *groups, "", "settings:", *settings, "", SWEEPS, "", EXAMPLES])
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, quoting
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.runs.trust import targets, trusting
@@ -57,7 +57,8 @@ class Job:
     def after(self, pretraining: Path) -> "Job":
         """Return the job with transfer from the pre-training in a folder."""
         config = {**self.config, "pretrained": str(pretraining)}
-        return Job(self.folder, [*self.overrides, f"pretrained={pretraining}"], config, pretraining)
+        places = [quoting.setting("pretrained", pretraining), quoting.setting("run_dir", self.folder)]
+        return Job(self.folder, [*self.overrides, *places], config, pretraining)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -78,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
             unfinished = complete(jobs, launcher, master)
     if unfinished:
         sys.exit("\n".join(unfinished))
-    print(f"all {len(jobs)} runs are complete: torchrl-mcp-report {master.run_root}")
+    print(f"all {len(jobs)} runs are complete: {quoting.command('report', master.run_root)}")
 
 
 def complete(jobs: Sequence[Job], launcher: Launcher, master: DictConfig) -> list[str]:
@@ -179,10 +180,10 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
             del cfg["hydra"]
         build.require_valid(cfg)
         build.require_environment(cfg)
-        config: Any = OmegaConf.to_container(experiment.settled(cfg), resolve=True)
+        config, folder = build.stored(experiment.settled(cfg)), Path(cfg.run_dir)
     finally:
         HydraConfig.instance().cfg = former
-    return Job(Path(config["run_dir"]), overrides, config)
+    return Job(folder, overrides, config)
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:
@@ -205,10 +206,9 @@ def conflict(job: Job) -> str | None:
     """Return why a job cannot use its folder, or None."""
     if not (job.folder / CONFIG).exists():
         return None
-    held: Any = OmegaConf.to_container(experiment.run_config(job.folder), resolve=True)
-    if not (changed := differences(held, job.config)):
+    if not (changed := experiment.changes(job.folder, job.config)):
         return None
-    return f"{job.folder} differs in {', '.join(changed)}: delete it, or choose another run_root"
+    return f"{job.folder} differs in {', '.join(changed)}: keep it, and choose another run_root"
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
@@ -245,7 +245,7 @@ def is_complete(folder: Path) -> bool:
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:
     """Return why a job is not complete, or None if it is."""
     if is_complete(job.folder):
-        return None
+        return conflict(job)  # with its pre-training, which may not have been there before
     if job in launched:
         return f"failed: {job.folder}, see {job.folder / LOG}"
     return f"not run: {job.folder}, which needs {job.needs}"

@@ -3,7 +3,7 @@
 import inspect
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -30,13 +30,16 @@ from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
-from torchrl_mcp.runs import settings
+from torchrl_mcp.runs import places, settings
 from torchrl_mcp.runs.trust import require_trusted, targets
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.trainer import Trainer
 from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts
+
+MADE_BY_RUNS = {"self", "kwargs", "character", "device", "num_envs", "num_threads", "physics", "pin_memory", "seed"}
+"""Arguments of environments that a run sets itself."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def require_valid(cfg: DictConfig) -> None:
         ValueError: As :func:`torchrl_mcp.runs.settings.require_valid`, or if a setting refers to one that is missing.
     """
     try:
-        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+        config = _plain(cfg)
     except OmegaConfBaseException as error:
         raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
     settings.require_valid(config)
@@ -88,6 +91,28 @@ def require_environment(cfg: DictConfig) -> None:
     if able and character not in able:
         known = " or ".join(able)
         raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+
+
+def require_files(cfg: DictConfig, task: DictConfig) -> None:
+    """Check that the files of a task's environments exist.
+
+    Args:
+        cfg: Configuration of the run.
+        task: Configuration of the environments.
+
+    Raises:
+        ValueError: If one is missing, with the settings that give a new place.
+    """
+    lost = {value: name for name, value in places.settings(_plain(task)) if not Path(value).exists()}
+    if not lost:
+        return
+    named = {value: name for name, value in places.outside(_plain(cfg)).items()}
+    value, argument = next(iter(lost.items()))
+    name = named.get(value, f"task.{cfg.stage.name}.{argument}")
+    raise ValueError(
+        f"{name}={value} does not exist: put it back, or give its new place by {name}=PATH, with resume= by "
+        f"+{name}=PATH, and to torchrl-mcp-play and torchrl-mcp-evaluate by --task {argument}=PATH"
+    )
 
 
 def require_equipment(cfg: DictConfig) -> None:
@@ -143,7 +168,7 @@ def require_known(config: Mapping[str, Any], source: Path) -> None:
 
 def named(cfg: DictConfig) -> list[str]:
     """Return the names of all classes and functions that a configuration calls."""
-    return list(targets(OmegaConf.to_container(cfg, resolve=True)))
+    return list(targets(_plain(cfg)))
 
 
 def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
@@ -153,8 +178,11 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
         ValueError: As :func:`require_environment`.
     """
     require_environment(cfg)
-    arguments = {"num_threads": cfg.num_threads, **kwargs}
-    env = instantiate(cfg.task[cfg.stage.name])(num_envs=num_envs, seed=seed, **arguments)
+    task, others = _with_parts(cfg.task[cfg.stage.name], kwargs)
+    _require_arguments(task["_target_"], others)
+    require_files(cfg, task)
+    arguments = {"num_threads": cfg.num_threads, **others}
+    env = instantiate(task)(num_envs=num_envs, seed=seed, **arguments)
     if not (transforms := instantiate(cfg.get("transforms", []))):
         return env
     return TransformedCharacterEnv(env, Compose(*transforms))
@@ -233,7 +261,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         frozen=agent.frozen,
         metrics_writer=MetricsWriter(folder),
         checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
-        config=cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)),
+        config=stored(cfg),
         max_grad_norm=cfg.objective.max_grad_norm,
         step_size_schedule=instantiate(cfg.optimizer.schedule),
         autocast=cfg.autocast,
@@ -288,6 +316,38 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
             break
     return found
+
+
+def stored(cfg: DictConfig) -> dict[str, Any]:
+    """Return a run's configuration as it is stored: resolved, and valid wherever the run folder is."""
+    here = OmegaConf.merge(cfg, {"run_dir": places.HERE, "run_root": places.HERE})
+    return places.stored(_plain(cast("DictConfig", here)))
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    """Return a configuration with all references resolved."""
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def _with_parts(task: DictConfig, arguments: Mapping[str, Any]) -> tuple[DictConfig, dict[str, Any]]:
+    """Return a task's configuration and its other arguments, after setting arguments of the objects that it builds."""
+    parts = {
+        name: value
+        for name, value in arguments.items()
+        if isinstance(value, Mapping) and OmegaConf.is_dict(task.get(name)) and "_target_" in task[name]
+    }
+    merged = cast("DictConfig", OmegaConf.merge(task, parts)) if parts else task
+    return merged, {name: value for name, value in arguments.items() if name not in parts}
+
+
+def _require_arguments(name: str, given: Collection[str]) -> None:
+    """Check that a task takes the arguments given, and list those that it takes."""
+    if not inspect.isclass(get_object(name)):
+        return
+    taken = arguments(name)
+    if unknown := [argument for argument in given if argument not in taken]:
+        listed = sorted(key for key in taken if key not in MADE_BY_RUNS)
+        raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 
 def _import(module: str, character: str) -> None:

@@ -1,7 +1,6 @@
 """Runs: training in a run folder, resuming, and evaluation at the end."""
 
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -9,19 +8,27 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.runs import build, lock
+from torchrl_mcp.runs import build, lock, places, quoting
 from torchrl_mcp.runs.build import make_agent, make_source, make_trainer
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import require_resumable, translated
 from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.policies import evaluation
-from torchrl_mcp.runs.provenance import provenance
+from torchrl_mcp.runs.provenance import continuation, provenance
 from torchrl_mcp.runs.trust import read_config, trusting
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.metrics import begin_after
 from torchrl_mcp.training.precision import choose, name
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, remove_leftovers, replacing, write_json
+from torchrl_mcp.training.run_folder import (
+    CONFIG,
+    EVALUATION,
+    PROVENANCE,
+    read_json,
+    remove_leftovers,
+    replacing,
+    write_json,
+)
 from torchrl_mcp.training.trainer import Trainer
 
 
@@ -39,7 +46,9 @@ def train(cfg: DictConfig) -> Path:
         return _train(cfg)
 
 
-def resume(folder: Path, *, device: str | None = None) -> Path:
+def resume(
+    folder: Path, *, device: str | None = None, total_frames: int | None = None, moves: Mapping[str, str] | None = None
+) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with its own configuration.
 
     A run that :func:`is_complete` is not changed. On another machine a run keeps its precision.
@@ -47,14 +56,20 @@ def resume(folder: Path, *, device: str | None = None) -> Path:
     Args:
         folder: The run folder.
         device: Device to go on with, or None for the run's own.
+        total_frames: Environment steps of the whole run, more than it has taken, or None for the run's own.
+        moves: New places of files and folders outside the run folder, by the names of their settings.
 
     Raises:
-        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, or this machine
-            lacks the device or the logger.
+        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, it is longer than
+            ``total_frames``, or this machine lacks the device, the logger or a file.
     """
-    if is_complete(folder):
+    if is_complete(folder) and not total_frames and not moves:
         return folder
+    known = places.outside(read_config(folder / CONFIG))
+    if unknown := sorted(set(moves or {}) - set(known)):
+        raise ValueError(f"{folder} has no files by {' and '.join(unknown)}, only by {list(known)}: leave them out")
     with _held(folder):
+        _change(folder, total_frames, moves or {})
         return _resume(folder, device)
 
 
@@ -62,16 +77,42 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
     """Train as configured, or resume the run if it has begun; return the folder.
 
     Args:
-        cfg: The configuration. A resumed run keeps its own, except for the device.
+        cfg: The configuration. A resumed run keeps its own, except for the device and the places of files.
         wait: If another process uses the run folder, wait for it.
 
     Raises:
-        ValueError: As :func:`train` and :func:`resume`.
+        ValueError: As :func:`train` and :func:`resume`, or if the folder holds a run with other settings.
     """
     folder = Path(cfg.run_dir)
     _require(cfg)
     with _held(folder, wait=wait), trusting(build.named(cfg)):
-        return _resume(folder, cfg.device) if (folder / CONFIG).exists() else _train(cfg)
+        if not (folder / CONFIG).exists():
+            return _train(cfg)
+        config = build.stored(settled(cfg))
+        if changed := changes(folder, config):
+            raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
+        if is_complete(folder):
+            print(f"{folder} is complete: nothing is left to do", flush=True)
+        _change(folder, None, {name: place for name, place in places.outside(config).items() if Path(place).exists()})
+        return _resume(folder, cfg.device)
+
+
+def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
+    """Return the settings in which the run in ``folder`` differs from a configuration, so that it is another run.
+
+    Files and folders outside the run folder are compared by their content, if both are known.
+
+    Args:
+        folder: The run folder.
+        config: The configuration, resolved and :func:`settled`.
+
+    Raises:
+        ValueError: If the folder holds no run, or one of another version of the library.
+    """
+    held = build.stored(run_config(folder))
+    inputs = _origin(folder).get("inputs", {})
+    other = [name for name, mark in places.digests(config).items() if inputs.get(name, mark) != mark]
+    return list(dict.fromkeys([*differences(held, config), *other]))
 
 
 def settled(cfg: DictConfig) -> DictConfig:
@@ -101,7 +142,7 @@ def run_config(folder: Path) -> DictConfig:
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     config = read_config(folder / CONFIG)
     build.require_known(config, folder / CONFIG)
-    return OmegaConf.create(translated(config))
+    return OmegaConf.create(places.located(translated(config), folder))
 
 
 def is_complete(folder: Path) -> bool:
@@ -119,6 +160,7 @@ def _require(cfg: DictConfig) -> None:
     """Check a configuration before its folder is made."""
     build.require_valid(cfg)
     build.require_environment(cfg)
+    build.require_files(cfg, cfg.task[cfg.stage.name])
     build.require_equipment(cfg)
 
 
@@ -132,24 +174,57 @@ def _held(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 def _train(cfg: DictConfig) -> Path:
     folder = Path(cfg.run_dir)
-    if (folder / CONFIG).exists():
-        raise ValueError(f"{folder} holds a run already: continue it with resume={folder}, or give another run_dir")
-    if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
-        raise ValueError(
-            f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: put that back to continue the "
-            "run, or give another run_dir"
-        )
+    _require_free(folder, cfg)
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
     print(f"{folder}: {precision}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(settled(cfg), {"autocast": precision.autocast}))
     trainer = _trainer(cfg, folder, pretrained)
     trainer.save()
-    write_json(provenance(cfg.device, *build.launched(), precision), folder / PROVENANCE)
+    inputs = places.digests(trainer.config)
+    write_json(provenance(cfg.device, *build.launched(), precision, inputs), folder / PROVENANCE)
     # Last, because the presence of this file means that there is a run to resume.
-    with replacing(folder / CONFIG) as partial:
-        OmegaConf.save(cfg, partial, resolve=True)
+    _write_config(trainer.config, folder)
     _finish(trainer, cfg, folder)
     return folder
+
+
+def _require_free(folder: Path, cfg: DictConfig) -> None:
+    """Check that a folder holds no run yet."""
+    if (folder / CONFIG).exists():
+        changed = changes(folder, build.stored(settled(cfg)))
+        held = f"a run that differs in {', '.join(changed)}: " if changed else ""
+        remedy = "" if changed else f"this run already: continue it with {quoting.resuming(folder)}, or "
+        raise ValueError(f"{folder} holds {held or remedy}give another run_dir")
+    if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
+        raise ValueError(
+            f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: put that back to continue the "
+            "run, or give another run_dir"
+        )
+
+
+def _write_config(config: Mapping[str, Any], folder: Path) -> None:
+    with replacing(folder / CONFIG) as partial:
+        OmegaConf.save(OmegaConf.create(dict(config)), partial)
+
+
+def _change(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> None:
+    """Change the length of a run, and the places of files outside its folder, in its configuration.
+
+    Raises:
+        ValueError: If the run is planned to be longer.
+    """
+    held = read_config(folder / CONFIG)
+    planned = held["training"]["total_frames"]
+    if (total := total_frames or planned) < planned:
+        raise ValueError(f"training.total_frames={total}: {folder} is planned for {planned} steps; give more, or none")
+    known = places.outside(held)
+    new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
+    config = {**places.moved(held, new), "training": {**held["training"], "total_frames": total}}
+    if config != held:
+        _write_config(config, folder)
+    if total > planned:
+        frames = run_folder.frames(checkpoint.find(folder))
+        write_json(continuation(_origin(folder), build.launched()[0], planned, total, frames), folder / PROVENANCE)
 
 
 def _resume(folder: Path, device: str | None = None) -> Path:
@@ -159,11 +234,17 @@ def _resume(folder: Path, device: str | None = None) -> Path:
     cfg = run_config(folder)
     cfg.device = device or cfg.device
     build.require_equipment(cfg)
+    build.require_files(cfg, cfg.task[cfg.stage.name])
     print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
     trainer = _restored(cfg, folder)
     (folder / EVALUATION).unlink(missing_ok=True)
     _finish(trainer, cfg, folder)
     return folder
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    """Return the provenance of the run in a folder, empty for older runs."""
+    return read_json(folder / PROVENANCE) if (folder / PROVENANCE).is_file() else {}
 
 
 def _restored(cfg: DictConfig, folder: Path) -> Trainer:
@@ -189,10 +270,9 @@ def _require_same_run(cfg: DictConfig, path: Path) -> None:
     Raises:
         ValueError: If it belongs to another run.
     """
-    wanted = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
     held, wanted = (
         {**config, "training": {**config["training"], "total_frames": None}}
-        for config in (translated(checkpoint.saved_config(path)), wanted)
+        for config in (translated(checkpoint.saved_config(path)), build.stored(cfg))
     )
     if changed := differences(held, wanted, CONDUCT | PLACES | {"evaluation", "budget"}):
         raise ValueError(
@@ -213,7 +293,7 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
 def _precision_kept(cfg: DictConfig, folder: Path) -> str:
     """Return a message about the precision of a resumed run, and about its first machine if that was another one."""
     precision = name(choose(cfg.autocast, cfg.device).autocast)
-    began = json.loads((folder / PROVENANCE).read_text())["machine"] if (folder / PROVENANCE).is_file() else {}
+    began = _origin(folder).get("machine", {})
     now = machine(cfg.device)
     if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
         return f"goes on with networks in {precision}"

@@ -3,8 +3,12 @@
 A setting is written as its path in the configuration. A path includes all settings below it.
 """
 
+import hashlib
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
+
+from torchrl_mcp.runs.places import BUILTIN, digest, placeless
 
 CONDUCT = frozenset(
     {
@@ -15,7 +19,10 @@ CONDUCT = frozenset(
 """Settings of how a run is executed: they make no other run. A resumed run keeps its own, except for ``device``."""
 
 PLACES = frozenset({"pretrained", "run_dir", "run_root"})
-"""Settings of where a run is stored, and where its transferred parts come from."""
+"""Settings of where a run is stored, and where its transferred parts come from.
+
+They make no other run, but the content of ``pretrained`` does: see :mod:`torchrl_mcp.runs.places`.
+"""
 
 LEVELS = ("task", "character", "stage", "method", "seed")
 """Settings that are a level each of the path of a run folder."""
@@ -36,6 +43,9 @@ TRANSFER_ONLY = frozenset(
 )
 """Settings that pre-training ignores or refuses."""
 
+LONGEST = 100
+"""Most characters of a folder's name, below the 255 bytes of common file systems."""
+
 LEFT_OPEN = {"autocast": "auto"}
 """Values that leave a setting to the machine: any other value counts as equal."""
 
@@ -49,12 +59,39 @@ def is_among(name: str, settings: Collection[str]) -> bool:
     return any(name == setting or name.startswith(f"{setting}.") for setting in settings)
 
 
-def differences(held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT) -> list[str]:
+def differences(
+    held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT | PLACES
+) -> list[str]:
     """Return the top-level settings in which two configurations differ, so that they are different runs.
+
+    Paths of files and folders are not compared.
 
     >>> differences({"seed": 0, "device": "cpu"}, {"seed": 1, "device": "cuda"})
     ['seed']
     """
     agreed = {*ignored, *(key for key, value in LEFT_OPEN.items() if wanted.get(key) == value)}
-    keys = dict.fromkeys([*held, *wanted])
-    return [key for key in keys if key not in agreed and held.get(key) != wanted.get(key)]
+    keys = [key for key in dict.fromkeys([*held, *wanted]) if key not in agreed]
+    return [key for key in keys if placeless(held.get(key)) != placeless(wanted.get(key))]
+
+
+def folder_name(overrides: str, pretrained: str | None) -> str:
+    """Return the name of the folder of a run's settings, for the resolver ``folder_name`` of ``conf/train.yaml``.
+
+    Args:
+        overrides: The settings on the command line, as Hydra joins them.
+        pretrained: Networks that the run begins with; those on the disk are named by their :func:`.places.digest`.
+
+    >>> folder_name("preset-smoke", None)
+    'preset-smoke'
+    """
+    if pretrained not in (None, BUILTIN):
+        path = Path(pretrained)
+        mark = digest(path) if path.exists() else _hash(pretrained)
+        overrides = "_".join(filter(None, (overrides, f"pretrained-{mark}")))
+    if len(overrides.encode()) <= LONGEST:
+        return overrides
+    return f"{overrides.encode()[: LONGEST - 9].decode(errors='ignore')}-{_hash(overrides)}"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

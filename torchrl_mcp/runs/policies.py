@@ -13,7 +13,7 @@ from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, places
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import translated
@@ -76,21 +76,24 @@ def publish_run(path: Path, output: Path) -> None:
         ValueError: If there is no checkpoint, it is damaged, or the frozen parts differ from the built-in network.
     """
     cfg, agent, _ = restore(path, num_envs=1, seed=0)
-    cfg.run_dir = cfg.run_root = "runs"  # the run's folder is of no use to others
+    cfg.run_dir = cfg.run_root = "."  # older runs have the folder where they began, which is of no use to others
     parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name not in agent.spare_parts})
     shared: dict[str, str] = {}
     if cfg.stage.name == "transfer" and cfg.pretrained == "builtin":
         shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
-    publish(parts, cast("dict[str, Any]", OmegaConf.to_container(cfg)), output, shared=shared)
+    config = cast("dict[str, Any]", OmegaConf.to_container(cfg))
+    names = {value: Path(value).name for value in places.outside(config).values()}  # without folders of this machine
+    publish(parts, places.moved(config, names), output, shared=shared)
 
 
-def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
+def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
     """Return the content of ``evaluation.json``: :func:`evaluate_run` in the environments of the run's configuration.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Episodes, one per environment.
         seed: Seed of environments and sampling.
+        **kwargs: Further arguments of the environments.
 
     Returns:
         ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, ``deterministic`` and
@@ -100,7 +103,7 @@ def evaluation(path: Path, *, episodes: int, seed: int) -> dict[str, Any]:
         ValueError: If there is no checkpoint or it is damaged.
     """
     settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
-    environment = settings["environment"]
+    environment = {**settings["environment"], **kwargs}
     numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
     return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
 
@@ -131,21 +134,23 @@ def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict
     return results
 
 
-def evaluate_clips(path: Path, *, episodes: int, seed: int) -> list[ClipResult]:
+def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> list[ClipResult]:
     """Return results of a run's deterministic policy on each of its reference motions.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Number of episodes per clip.
         seed: Seed of the environments.
+        **kwargs: Arguments of the environments that replace the run's own.
 
     Raises:
         ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
     """
-    _, _, env = restore(path, num_envs=1, seed=seed)
+    _, _, env = restore(path, num_envs=1, seed=seed, **kwargs)
     if not hasattr(env, "library"):
         raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
     num_envs = episodes * len(env.library)
     # An episode follows one clip, and ends with it.
-    _, agent, env = restore(path, num_envs=num_envs, seed=seed, switch_interval=math.inf, clip_end="truncate")
+    alone = {**kwargs, "switch_interval": math.inf, "clip_end": "truncate"}
+    _, agent, env = restore(path, num_envs=num_envs, seed=seed, **alone)
     return follow_each(agent.actor.policy, env)

@@ -14,7 +14,9 @@ from torchrl_mcp.training.precision import Precision
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision) -> dict[str, Any]:
+def provenance(
+    device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision, inputs: Mapping[str, str]
+) -> dict[str, Any]:
     """Return the provenance of a run, JSON-compatible.
 
     Args:
@@ -22,11 +24,12 @@ def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], 
         command: Words of the command that started the run.
         choices: Choice of each group of the configuration.
         precision: Precision of the networks.
+        inputs: Digests of the files outside the run folder, by the names of their settings.
 
     Returns:
         ``command``; ``commit`` of the library, with ``-dirty`` if files were changed since, or None without a
-        checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``started``, an ISO time; and the
-        ``machine``.
+        checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``inputs``; ``started``, an ISO
+        time; and the ``machine``.
     """
     return {
         "command": list(command),
@@ -34,9 +37,29 @@ def provenance(device: str, command: Sequence[str], choices: Mapping[str, str], 
         "version": __version__,
         "choices": dict(choices),
         "precision": str(precision),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "inputs": dict(inputs),
+        "started": _now(),
         "machine": machine(device),
     }
+
+
+def continuation(
+    origin: Mapping[str, Any], command: Sequence[str], planned: int, total: int, frames: int
+) -> dict[str, Any]:
+    """Return the provenance of a run that becomes longer than planned.
+
+    Args:
+        origin: The provenance so far.
+        command: Words of the command that makes it longer.
+        planned: Environment steps of the run so far.
+        total: Environment steps of the run from now on.
+        frames: Environment steps that it has taken.
+
+    Returns:
+        ``origin`` with one more entry in ``extended``.
+    """
+    entry = {"command": list(command), "started": _now(), "planned": planned, "total_frames": total, "after": frames}
+    return {**origin, "extended": [*origin.get("extended", []), entry]}
 
 
 def commit(folder: Path) -> str | None:
@@ -52,3 +75,7 @@ def commit(folder: Path) -> str | None:
 def _git(folder: Path, *arguments: str) -> str | None:
     outcome = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True)
     return outcome.stdout.strip() or None if outcome.returncode == 0 else None
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,139 @@
+"""Files and folders in configurations, so that a run can be moved, copied and continued from anywhere.
+
+A stored configuration has the run folder as ``.``, and everything outside it as an absolute path. These places do not
+identify a run, but the content of what lies outside does.
+"""
+
+import hashlib
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+from torchrl_mcp.training.run_folder import find_all
+
+HERE = "."
+"""The run folder in its own configuration."""
+
+PRETRAINED = "pretrained"
+NAMES = (PRETRAINED, "path")
+"""Names of settings whose value is a file or folder outside the run folder, in any group."""
+
+GET_CLASS = "hydra.utils.get_class"
+"""Hydra's function whose argument ``path`` is the name of a class."""
+
+BUILTIN = "builtin"
+"""Value of ``pretrained`` for the networks that come with the library."""
+
+
+def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the name and value of every setting that is a file or folder.
+
+    >>> list(settings({"seed": 0, "pretrained": "runs/a", "motions": {"path": "clips"}}))
+    [('pretrained', 'runs/a'), ('motions.path', 'clips')]
+    """
+    if isinstance(config, list):
+        for item in config:
+            yield from settings(item, prefix)
+    elif isinstance(config, Mapping):
+        for key, value in config.items():
+            if not isinstance(value, str):
+                yield from settings(value, f"{prefix}{key}.")
+            elif key in NAMES and value != BUILTIN and config.get("_target_") != GET_CLASS:
+                yield f"{prefix}{key}", value
+
+
+def outside(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the files and folders outside the run folder, each by the shortest name of its settings."""
+    found: dict[str, str] = {}
+    for name, value in sorted(settings(config), key=lambda pair: pair[0].count(".")):
+        if value not in found.values():
+            found[name] = value
+    return found
+
+
+def stored(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration with absolute paths.
+
+    Args:
+        config: The resolved configuration, with :data:`HERE` as ``run_dir``.
+    """
+    moves = {value: str(Path(value).absolute()) for _, value in settings(config)}
+    return moved(config, moves)
+
+
+def moved(config: Mapping[str, Any], moves: Mapping[str, str]) -> dict[str, Any]:
+    """Return a configuration with other files and folders.
+
+    Args:
+        config: The configuration.
+        moves: New values by the old ones.
+    """
+    names = dict(settings(config))
+    return _mapped(config, lambda name, value: moves.get(value, value) if name in names else value)
+
+
+def located(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a stored configuration with references to ``run_dir`` in place of :data:`HERE`.
+
+    Args:
+        config: The stored configuration. Those of older versions have the folder where the run began.
+        folder: The run folder.
+    """
+    here = str(config.get("run_dir", HERE))
+
+    def locate(name: str, value: str) -> str:
+        inside = value == here or value.startswith(f"{here}/")
+        # The name of a folder, as in older versions, may also be that of a task.
+        if inside and (here == HERE or "/" in here or name.startswith("logger.")):
+            return f"${{run_dir}}{value.removeprefix(here)}"
+        return value
+
+    return _mapped(config, locate) | {"run_dir": str(folder), "run_root": str(folder)}
+
+
+def placeless(config: Any) -> Any:
+    """Return a part of a configuration without the values of settings that are files or folders."""
+    names = dict(settings(config))
+    return _mapped(config, lambda name, value: "" if name in names else value)
+
+
+def digests(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the :func:`digest` of every existing file or folder outside the run folder, by the name of its setting."""
+    return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()}
+
+
+def digest(path: Path) -> str:
+    """Return eight letters that identify the content of a file or folder, wherever it is.
+
+    Of a run folder they identify the networks in its newest checkpoint, and of a checkpoint file its networks.
+    """
+    file = next(iter(find_all(path)), path)
+    if file.suffix == ".torchrl" and file.is_file():
+        parts = _networks(file)
+    elif file.is_dir():
+        parts = [(str(part.relative_to(file)), _crc(part)) for part in sorted(file.rglob("*")) if part.is_file()]
+    else:
+        parts = [(file.name, _crc(file))]
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:8]
+
+
+def _networks(file: Path) -> list[tuple[str, int]]:
+    """Return the names and checksums of the tensors of an agent's parts in a checkpoint file."""
+    with ZipFile(file) as archive:
+        members = [(member.filename.partition("-part-")[2], member.CRC) for member in archive.infolist()]
+    return sorted(pair for pair in members if pair[0].endswith(".memmap"))
+
+
+def _crc(file: Path) -> int:
+    return zlib.crc32(file.read_bytes())
+
+
+def _mapped(value: Any, change: Callable[[str, str], str], name: str = "") -> Any:
+    """Return a tree of settings with every text changed by a function of its name and value."""
+    if isinstance(value, Mapping):
+        return {key: _mapped(inner, change, f"{name}.{key}" if name else str(key)) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_mapped(item, change, name) for item in value]
+    return change(name, value) if isinstance(value, str) else value
