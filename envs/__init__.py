@@ -7,10 +7,7 @@ if __name__ != "torchrl_mcp.envs":
     )
 
 from torchrl_mcp.envs.base import CharacterEnv
-from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.curriculum import Curriculum
-from torchrl_mcp.envs.gymnasium_env import register, register_holdout, register_imitation
-from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.tasks.carry import Carry
 from torchrl_mcp.envs.tasks.dribble import Dribble
@@ -19,7 +16,3 @@ from torchrl_mcp.envs.tasks.holdout import Holdout
 from torchrl_mcp.envs.tasks.imitation import Imitation
 
 __all__ = ["Carry", "CharacterEnv", "Curriculum", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
-
-register([Heading, Carry, Dribble], CHARACTERS)
-register_holdout(Holdout)
-register_imitation(Imitation, CHARACTERS, generated_library)

@@ -1,8 +1,6 @@
 """Gymnasium environments of a single simulation."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -12,11 +10,15 @@ import torch
 import yaml  # type: ignore[import-untyped]
 from tensordict import TensorDict, TensorDictBase
 
+from torchrl_mcp import envs
 from torchrl_mcp.envs.base import CharacterEnv
+from torchrl_mcp.envs.motions import generated_library
 
 
 class GymnasiumEnv(gymnasium.Env):
     """A single simulation of a task with Gymnasium's interface; training with many at once is several times faster.
+
+    A copy, or what is unpickled, is a new simulation in the same state, with the same random numbers ahead.
 
     The observation is a dictionary of ``observation`` and ``goal``; ``info`` has the task's metrics, such as
     ``success`` of carrying and dribbling.
@@ -27,7 +29,7 @@ class GymnasiumEnv(gymnasium.Env):
         **kwargs: Passed on to the task.
 
     Example:
-        >>> import torchrl_mcp.envs
+        >>> import torchrl_mcp
         >>> env = gymnasium.make("torchrl_mcp/Heading-Biped-v0")
         >>> observation, info = env.reset(seed=0)
         >>> {name: value.shape for name, value in observation.items()}
@@ -37,6 +39,7 @@ class GymnasiumEnv(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, task: type[CharacterEnv], *, render_mode: str | None = None, **kwargs: Any) -> None:
+        self._made = {"task": task, "render_mode": render_mode, **kwargs}
         self.env = task(num_envs=1, num_threads=1, **kwargs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.env.control_timestep)}
         self.render_mode = render_mode
@@ -48,6 +51,18 @@ class GymnasiumEnv(gymnasium.Env):
                 for key in ("observation", "goal")
             }
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what rebuilds the environment, and its state: MuJoCo's batch itself cannot be copied."""
+        rest = {name: value for name, value in vars(self).items() if name not in ("env", "metadata")}
+        return {**rest, "state": self.env.get_extra_state()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Rebuild the environment in a state."""
+        self.__init__(**state["_made"])  # type: ignore[misc]
+        self.env.set_extra_state(state["state"])
+        self.env.reset()  # to that state
+        vars(self).update({name: value for name, value in state.items() if name != "state"})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -84,30 +99,22 @@ class GymnasiumEnv(gymnasium.Env):
         return {key: outcome[key][0].numpy() for key in ("observation", "goal")}
 
 
-def register(tasks: Sequence[type[CharacterEnv]], characters: Iterable[str]) -> None:
-    """Register every task with every character in Gymnasium, such as ``torchrl_mcp/Heading-Biped-v0``."""
-    for task in tasks:
-        for character in characters:
-            _register(task.__name__, character, partial(GymnasiumEnv, task, character=character))
+def make(task: str, character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:
+    """Return an environment that Gymnasium knows by name, with the defaults of its task.
 
+    Holdout has all directions, and imitation follows the generated motions with the reward of ``imitation=fast``.
 
-def register_holdout(task: type[CharacterEnv]) -> None:
-    """Register ``torchrl_mcp/Holdout-Ant-v0``, by default with all directions."""
-    (character,) = task.characters()
-    _register(task.__name__, character, partial(GymnasiumEnv, task, directions=(0.0, 2 * math.pi)))
-
-
-def register_imitation(task: type[CharacterEnv], characters: Iterable[str], motions: Callable[[str, int], Any]) -> None:
-    """Register imitation with every character, with ``motions`` of a seed and the reward of ``imitation=fast``."""
-
-    def make(character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:
+    Args:
+        task: Name of the task's class.
+        character: Name of the character.
+        seed_of_motions: Seed of the generated motions.
+        **kwargs: Passed on to :class:`GymnasiumEnv`.
+    """
+    kind = getattr(envs, task)
+    if task == "Holdout":
+        return GymnasiumEnv(kind, **{"directions": (0.0, 2 * math.pi), **kwargs})
+    if task == "Imitation":
         terms = yaml.safe_load(files("torchrl_mcp.conf").joinpath("imitation/fast.yaml").read_text())["terms"]
-        settings = {"clips": motions(character, seed_of_motions), "terms": terms, **kwargs}
-        return GymnasiumEnv(task, character=character, **settings)
-
-    for character in characters:
-        _register(task.__name__, character, partial(make, character))
-
-
-def _register(task: str, character: str, entry_point: Callable[..., GymnasiumEnv]) -> None:
-    gymnasium.register(f"torchrl_mcp/{task}-{character.capitalize()}-v0", entry_point=entry_point)
+        clips = kwargs.pop("clips", None) or generated_library(character, seed_of_motions)
+        kwargs = {"clips": clips, "terms": terms, **kwargs}
+    return GymnasiumEnv(kind, character=character, **kwargs)

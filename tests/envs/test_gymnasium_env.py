@@ -1,3 +1,7 @@
+import copy
+import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -7,14 +11,55 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from torchrl_mcp.envs import Heading
+from torchrl_mcp.envs.characters import CHARACTERS
 
 NAMES = sorted(name for name in gymnasium.registry if name.startswith("torchrl_mcp/"))
 
 
 def test_every_task_is_registered_with_every_character():
-    tasks, characters = ("Carry", "Dribble", "Heading", "Imitation"), ("Biped", "Humanoid", "Trex")
-    pairs = [(task, character) for task in tasks for character in characters] + [("Holdout", "Ant")]
-    assert sorted(f"torchrl_mcp/{task}-{character}-v0" for task, character in pairs) == NAMES
+    tasks = ("Carry", "Dribble", "Heading", "Imitation")
+    pairs = [(task, character) for task in tasks for character in CHARACTERS] + [("Holdout", "ant")]
+    assert sorted(f"torchrl_mcp/{task}-{character.capitalize()}-v0" for task, character in pairs) == NAMES
+
+
+def test_importing_the_package_registers_and_imports_nothing_slow():
+    code = """
+import sys, gymnasium, torchrl_mcp
+print(gymnasium.spec("torchrl_mcp/Heading-Biped-v0").id, {"torch", "mujoco", "hydra"} & set(sys.modules))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["torchrl_mcp/Heading-Biped-v0", "set()"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_specification_can_be_written_as_json_and_read_again(name):
+    spec = gymnasium.spec(name)
+    assert gymnasium.envs.registration.EnvSpec.from_json(spec.to_json()) == spec
+
+
+def moves(env, number):
+    """What an environment answers to random actions, through the ends of episodes."""
+    answers = []
+    for action in np.random.default_rng(1).uniform(-1, 1, (number, *env.action_space.shape)).astype(np.float32):
+        observation, reward, terminated, truncated, _ = env.step(action)
+        answers += [observation["observation"].copy(), reward, terminated, truncated]
+        if terminated or truncated:
+            answers.append(env.reset()[0]["goal"].copy())
+    return answers
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+@pytest.mark.parametrize("name", ["Heading-Biped", "Dribble-Trex", "Holdout-Ant", "Imitation-Trex"])
+def test_a_copy_goes_on_as_the_original(name, copied):
+    env = gymnasium.make(f"torchrl_mcp/{name}-v0", max_episode_steps=30)
+    env.reset(seed=3)
+    moves(env, 5)
+    other = copied(env)
+    assert other.spec == env.spec
+    assert other.unwrapped.env is not env.unwrapped.env
+    for one, two in zip(moves(env, 40), moves(other, 40), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert copied(gymnasium.make(f"torchrl_mcp/{name}-v0")).reset(seed=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
