@@ -54,4 +54,4 @@ def test_the_final_return_is_that_of_the_evaluation_or_else_the_last_that_is_kno
 def test_before_the_first_episode_ends_there_is_no_return(folder):
     (folder / "metrics.csv").write_text("iteration,episode/normalised_return\n1,nan\n")
     assert final_return(folder) is None
-    assert "no episode has ended" in summary(folder)
+    assert "no episode of full length has ended" in summary(folder)

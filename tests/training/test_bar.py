@@ -59,9 +59,18 @@ def test_without_a_terminal_there_is_a_plain_line_every_minute(clock):
         for clock[0] in (30, 59, 61, 100, 125):
             bar.advance(10_000, "return 0.500" if clock[0] < 60 else "")
     assert "\r" not in log.getvalue()
-    lines = log.getvalue().splitlines()
+    estimate, *lines = log.getvalue().splitlines()
+    assert estimate.startswith("about 43 min for 880,000 steps on this machine; ")  # 10,000 took 29 s
     assert [line.split(" steps")[0] for line in lines] == ["130,000 of 1,000,000", "150,000 of 1,000,000"]
     assert re.search(r"492 steps/s, 29 min left, return 0.500", lines[0])
+
+
+def test_a_training_of_a_minute_needs_no_estimate_and_ends_at_its_total(clock):
+    log = io.StringIO()
+    with TrainingBar(100, file=log) as bar:
+        for clock[0] in (1, 30, 61):
+            bar.advance(40, math.nan)
+    assert log.getvalue().splitlines() == ["100 of 100 steps, 2 steps/s, 0 min left"]
 
 
 def test_a_minute_without_a_step_is_a_line_that_says_so(clock):

@@ -51,6 +51,16 @@ def test_no_episode_that_ended_gives_empty_tensors():
     assert returns.shape == lengths.shape == (0,)
 
 
+def test_it_counts_the_steps_of_each_environment():
+    statistics = EpisodeStatistics(2)
+    for _ in range(3):
+        statistics.update(batch(torch.zeros(2, 5), torch.ones(2, 5, dtype=torch.bool)))
+    assert statistics.steps == 15
+    continued = EpisodeStatistics(2)
+    continued.load_state_dict(statistics.state_dict())
+    assert continued.steps == 15
+
+
 def test_its_state_continues_the_episodes_under_way():
     original, continued = EpisodeStatistics(2), EpisodeStatistics(2)
     original.update(batch([[1.0, 2.0], [3.0, 4.0]], [[False, False], [True, False]]))

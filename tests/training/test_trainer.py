@@ -291,3 +291,11 @@ def test_metrics_are_means_over_the_episodes_that_ended_and_over_all_steps(tmp_p
     assert metrics["episode/return"] == pytest.approx(returns.mean().item(), rel=1e-5)
     assert metrics["episode/normalised_return"] == pytest.approx(returns.mean().item() / 5, rel=1e-5)
     assert metrics["reward"] == pytest.approx(rewards.mean().item(), rel=1e-5)
+
+
+def test_returns_wait_until_episodes_can_have_their_full_length(tmp_path):
+    settings = ["method=scratch", "task=heading", "width=0.05", "+task.transfer.max_episode_steps=50"]
+    experiment.train(configure(tmp_path, *settings, "evaluation.episodes=0", "training.total_frames=384"))
+    found = rows(tmp_path)  # of 32 steps in each environment
+    assert [int(row["episode/count"]) > 0 for row in found] == [True, True, True]  # a biped falls within a second
+    assert [row["episode/normalised_return"] == "nan" for row in found] == [True, False, False]

@@ -52,10 +52,8 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
             + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
         if reach := numbers.get("reach"):
-            print(
-                f"    {reach['place']:.0%} of the way from standing still ({reach['standing']:.3f}) to an ideal player "
-                f"({reach['ideal']:.3f})"
-            )
+            share, standing, ideal = round(100 * reach["place"]), reach["standing"], reach["ideal"]
+            print(f"    {share}% of the way from standing still ({standing:.3f}) to an ideal player ({ideal:.3f})")
         if found := numbers["diagnostics"]:
             print(text_table([{"diagnostic": name, "value": value} for name, value in found.items()]))
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:

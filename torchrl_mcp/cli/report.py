@@ -1,6 +1,7 @@
 """``torchrl-mcp-report``: the results of many runs beside the paper's, as a web page and as Markdown."""
 
 import argparse
+import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +30,9 @@ def main() -> None:
         with replacing(arguments.output / name) as partial:
             partial.write_text(text, encoding="utf-8")
     counts = ", ".join(f"{number} {state}" for state, number in states(runs, damaged).items() if number)
-    print(f"{len(runs) + len(damaged)} runs, {counts}: {' '.join(str(arguments.output / name) for name in pages)}")
+    number = len(runs) + len(damaged)
+    places = shlex.join(str(arguments.output / name) for name in pages)
+    print(f"{number} run{'s' if number > 1 else ''}, {counts}: {places}")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -20,7 +20,7 @@ def summary(folder: Path) -> str:
 
 
 def final_return(folder: Path) -> float | None:
-    """Return the normalised return of the run in a folder, or None if no episode has ended.
+    """Return the normalised return of the run in a folder, or None if it has none.
 
     It is the return of the evaluation with deterministic actions, or without one, the last return of training.
     """
@@ -39,7 +39,8 @@ def _returns(folder: Path) -> list[str]:
     """Return lines with the returns of deterministic and of sampled actions, and of the paper."""
     if not (evaluation := _evaluation(folder)):
         last = last_return(folder)
-        return [f"normalised return in training: {'no episode has ended' if last is None else f'{last:.3f}'}"]
+        shown = "none, since no episode of full length has ended" if last is None else f"{last:.3f}"
+        return [f"normalised return in training: {shown}"]
     modes = {mode: evaluation[mode] for mode in ("deterministic", "stochastic")}
     values = [
         "{} {:.3f} ({:.3f} to {:.3f})".format(mode, numbers["normalised_return"], *numbers["interval"])
@@ -48,7 +49,9 @@ def _returns(folder: Path) -> list[str]:
     episodes = f"normalised return of {evaluation['episodes']} episodes, with 95 % intervals:"
     if reach := modes["deterministic"].get("reach"):
         standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
-        values.insert(1, f"{reach['place']:.0%} of the way from standing still ({standing}) to the ideal ({ideal})")
+        values.insert(
+            1, f"{round(100 * reach['place'])}% of the way from standing still ({standing}) to the ideal ({ideal})"
+        )
     return [episodes, *(f"  {value}" for value in [*values, *_paper(OmegaConf.load(folder / CONFIG))])]
 
 

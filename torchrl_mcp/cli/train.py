@@ -5,7 +5,7 @@ import sys
 from importlib.resources import files
 
 from torchrl_mcp.cli.parsing import add_trust, find_own_modules, new_parser, take_trust
-from torchrl_mcp.training.workers import end_with_parent_while_starting
+from torchrl_mcp.training.workers import end_with_parent_while_starting, termination_as_interrupt
 
 end_with_parent_while_starting()  # before the imports that take a worker seconds
 
@@ -55,7 +55,7 @@ def main() -> None:
     arguments = [word for word in words if word not in ("-m", "--multirun")]
     is_benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
-        with trusting(trusted):
+        with trusting(trusted), termination_as_interrupt():
             run_benchmark(arguments) if is_benchmark else run()
     except HydraException as error:
         sys.exit(f"{PROGRAM}: {answer(error, words, multirun=is_benchmark or arguments != words)}")

@@ -79,7 +79,8 @@ def main(arguments: Sequence[str]) -> None:
             unfinished = complete(jobs, launcher, master)
     if unfinished:
         sys.exit("\n".join(unfinished))
-    print(f"all {len(jobs)} runs are complete: {quoting.command('report', master.run_root)}")
+    done = f"all {len(jobs)} runs are" if len(jobs) > 1 else "the run is"
+    print(f"{done} complete: {quoting.command('report', master.run_root)}")
 
 
 def complete(jobs: Sequence[Job], launcher: Launcher, master: DictConfig) -> list[str]:

@@ -176,7 +176,7 @@ def _train(cfg: DictConfig) -> Path:
     folder = Path(cfg.run_dir)
     _require_free(folder, cfg)
     pretrained, precision = _pretrained(cfg), choose(cfg.autocast, cfg.device)
-    print(f"{folder}: {precision}", flush=True)
+    print(f"run folder: {folder}{f', {precision}' if precision.autocast else ''}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(settled(cfg), {"autocast": precision.autocast}))
     trainer = _trainer(cfg, folder, pretrained)
     trainer.save()
@@ -235,7 +235,7 @@ def _resume(folder: Path, device: str | None = None) -> Path:
     cfg.device = device or cfg.device
     build.require_equipment(cfg)
     build.require_files(cfg, cfg.task[cfg.stage.name])
-    print(f"{folder}: {_precision_kept(cfg, folder)}", flush=True)
+    print(f"{folder} goes on{_elsewhere(cfg, folder)}", flush=True)
     trainer = _restored(cfg, folder)
     (folder / EVALUATION).unlink(missing_ok=True)
     _finish(trainer, cfg, folder)
@@ -290,15 +290,14 @@ def _trainer(cfg: DictConfig, folder: Path, pretrained: Path | None = None) -> T
     return make_trainer(cfg, agent, source, folder)
 
 
-def _precision_kept(cfg: DictConfig, folder: Path) -> str:
-    """Return a message about the precision of a resumed run, and about its first machine if that was another one."""
+def _elsewhere(cfg: DictConfig, folder: Path) -> str:
+    """Return a message if a resumed run began on another machine, empty if it did not."""
     precision = name(choose(cfg.autocast, cfg.device).autocast)
-    began = _origin(folder).get("machine", {})
-    now = machine(cfg.device)
+    began, now = _origin(folder).get("machine", {}), machine(cfg.device)
     if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
-        return f"goes on with networks in {precision}"
+        return ""
     return (
-        f"began on {began['processor']} ({began['device']}) and goes on on {now['processor']} ({now['device']}), with "
+        f" on {now['processor']} ({now['device']}), after it began on {began['processor']} ({began['device']}), with "
         f"networks in {precision} as it began"
     )
 

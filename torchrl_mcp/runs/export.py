@@ -71,8 +71,8 @@ def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> Export
 
 def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> None:
     """Write a policy for ``torch.export.load``, which needs torch alone."""
-    with replacing(path) as partial:
-        torch.export.save(export(policy, states), partial)
+    with replacing(path) as partial, partial.open("wb") as file:  # torch warns of names without its suffix
+        torch.export.save(export(policy, states), file)
 
 
 def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:

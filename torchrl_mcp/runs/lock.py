@@ -1,6 +1,7 @@
 """The lock of a run folder, held by one process at a time and released when it ends, on POSIX and on Windows."""
 
 import contextlib
+import errno
 import os
 import socket
 import sys
@@ -15,6 +16,9 @@ LOCK = ".lock"
 
 PAUSE = 0.05
 """Seconds between attempts."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a disk without space, which say what to do."""
 
 ATTEMPTS = 20
 """Number of attempts before a lock counts as held: :func:`holder` also takes it, briefly."""
@@ -55,12 +59,11 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
         wait: Wait until the lock is free.
 
     Raises:
-        ValueError: If another process holds the lock and ``wait`` is false.
+        ValueError: If another process holds the lock and ``wait`` is false, or the folder cannot be written.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     while True:
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / LOCK).open("a+") as file:
+        with _opened(folder) as file:
             if not _taken(file, folder, wait) or not _is_there(file, folder):
                 continue
             file.truncate(0)
@@ -71,6 +74,21 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
             finally:
                 _remove(folder, made)
             return
+
+
+def _opened(folder: Path) -> IO[str]:
+    """Open the file of the lock.
+
+    Raises:
+        ValueError: If the folder cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return (folder / LOCK).open("a+")
+    except OSError as error:
+        if error.errno in FULL:
+            raise
+        raise ValueError(f"{folder} cannot be written ({error.strerror}): give another run_dir or run_root") from error
 
 
 def holder(folder: Path) -> str | None:

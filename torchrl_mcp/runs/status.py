@@ -170,7 +170,7 @@ def _tell(folder: Path, runs: Runs | None, ended: threading.Event) -> None:
 
 
 def _cells(one: Status) -> tuple[str, ...]:
-    steps = f"{one.frames:,}/{one.total:,}"
+    steps = f"{min(one.frames, one.total):,}/{one.total:,}"  # the last batch may exceed the total
     speed = f"{one.speed:,.0f}" if one.state == "running" and one.speed else "-"
     score = "-" if one.normalised_return is None else f"{one.normalised_return:.3f}"
     left = "-" if one.remaining is None else f"{one.remaining / 60:.0f} min"

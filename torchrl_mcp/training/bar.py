@@ -11,6 +11,22 @@ from torchrl_mcp.evaluation.bars import bar
 QUIET = 60.0
 """Seconds between lines if there is no terminal."""
 
+BRIEF = 120.0
+"""Seconds of a training that needs no estimate."""
+
+
+FIRST = 2.0
+"""Seconds of batches that an estimate is made of."""
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in words.
+
+    >>> duration(90), duration(9000)
+    ('2 min', '2.5 h')
+    """
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
 
 class TrainingBar:
     """Steps, speed, time left and a note on a training: a bar on a terminal, else a line every minute.
@@ -27,6 +43,8 @@ class TrainingBar:
         self._total, self._done, self._first, self._shown = total, done, done, shown
         self._began = self._told = time.monotonic()
         self._note = ""
+        self._second: tuple[float, int] | None = None  # time and steps at the beginning of the second batch
+        self._estimated = not shown
         form = "{n_fmt}/{total_fmt} {rate_fmt} {elapsed}<{remaining}{postfix}"
         self._bar: tqdm | None = None
         if shown and self._file.isatty():
@@ -51,6 +69,7 @@ class TrainingBar:
         """
         self._done += steps
         self._note = note or self._note
+        self._estimate()
         if self._bar is not None:
             self._bar.set_postfix_str(self._note, refresh=False)
             self._bar.update(min(self._done, self._total) - self._bar.n)
@@ -58,8 +77,26 @@ class TrainingBar:
             self._told = time.monotonic()
             print(self._line(), file=self._file, flush=True)
 
+    def _estimate(self) -> None:
+        """Say once how long the training will take; the first batch, which prepares what others use, is not counted."""
+        if self._estimated:
+            return
+        now = time.monotonic()
+        if self._second is None:
+            self._second = now, self._done
+            return
+        began, done = self._second
+        if now - began < FIRST or self._done == done:
+            return
+        self._estimated = True
+        left = self._total - self._done
+        seconds = left * (now - began) / (self._done - done)
+        if seconds >= BRIEF:
+            line = f"about {duration(seconds)} for {left:,} steps on this machine; shorter: training.total_frames=N"
+            tqdm.write(line, file=self._file) if self._bar is not None else print(line, file=self._file, flush=True)
+
     def _line(self) -> str:
         speed = (self._done - self._first) / (self._told - self._began)
-        left = f"{max(self._total - self._done, 0) / speed / 60:.0f} min left" if speed else ""
-        parts = [f"{self._done:,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, self._note]
+        left = f"{duration(max(self._total - self._done, 0) / speed)} left" if speed else ""
+        parts = [f"{min(self._done, self._total):,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, self._note]
         return ", ".join(filter(None, parts))

@@ -1,5 +1,8 @@
 """Returns and lengths of the episodes that end during training."""
 
+import math
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -12,15 +15,21 @@ class EpisodeStatistics:
 
     Args:
         num_envs: Number of environments, ``N``.
+
+    Attributes:
+        steps: Steps so far in each environment. While there are fewer than an episode may have, only episodes that
+            end early have ended: the mean of their returns is not that of all.
     """
 
     def __init__(self, num_envs: int) -> None:
+        self.steps: float = 0
         self.returns = torch.zeros(num_envs)
         self.lengths = torch.zeros(num_envs)
 
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Add trajectories ``(N, T)``; return the return and length of each of the ``E`` ended episodes, ``(E,)``."""
         ended_returns, ended_lengths = [], []
+        self.steps += batch.shape[1]
         rewards, dones = task_reward(batch["next"]).squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
             self.returns += reward
@@ -31,10 +40,11 @@ class EpisodeStatistics:
             self.lengths[done] = 0
         return torch.cat(ended_returns), torch.cat(ended_lengths)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the sums of the unfinished episodes."""
-        return {"returns": self.returns, "lengths": self.lengths}
+    def state_dict(self) -> dict[str, Any]:
+        """Return the steps, and the sums of the unfinished episodes."""
+        return {"steps": self.steps, "returns": self.returns, "lengths": self.lengths}
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore the result of :meth:`state_dict`."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the result of :meth:`state_dict`; older ones lack the steps."""
+        self.steps = state.get("steps", math.inf)
         self.returns, self.lengths = state["returns"].clone(), state["lengths"].clone()

@@ -19,7 +19,7 @@ METRICS = "metrics.csv"
 """A row of metrics per iteration."""
 
 NORMALISED_RETURN = "episode/normalised_return"
-"""The column of metrics with the mean of the episodes that ended, blank if none did."""
+"""The column of metrics with the mean of the episodes that ended, blank before any can have its full length."""
 
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""

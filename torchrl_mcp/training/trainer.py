@@ -264,8 +264,10 @@ class Trainer:
 
     def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         returns, lengths = self.episodes.update(batch)
+        if self.episodes.steps < self.source.env.max_episode_steps:  # only episodes that fell have ended
+            returns = returns.new_empty(0)
         return {
-            "episode/count": len(returns),
+            "episode/count": len(lengths),
             "episode/return": returns.mean().item(),
             NORMALISED_RETURN: self.source.env.normalised_return(returns).mean().item(),
             "episode/length": lengths.mean().item(),

@@ -78,6 +78,23 @@ def end_with_parent_while_starting() -> None:
         threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
 
 
+@contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """Take SIGTERM, as ``kill`` and schedulers send it, for an interrupt while the block runs, so that it cleans up."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    former = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
 def _started_beside(others: set[BaseProcess]) -> list[BaseProcess]:
     """Return the child processes that are not among ``others``, in the order of their start."""
     return sorted(set(multiprocessing.active_children()) - others, key=lambda process: process.pid or 0)
