@@ -5,7 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import announce, interruptible, new_parser
 
 PROGRAM = "torchrl-mcp-character"
 
@@ -16,6 +16,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()

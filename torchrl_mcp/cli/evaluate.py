@@ -10,13 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, announce, new_parser, task_settings
+from torchrl_mcp.cli.parsing import add_task, add_trust, announce, interruptible, new_parser, task_settings
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
 
 PROGRAM = "torchrl-mcp-evaluate"
 
 
+@interruptible
 def main() -> None:
     """Play one episode in each of many environments and print the statistics."""
     arguments = parser().parse_args()

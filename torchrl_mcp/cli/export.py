@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
 from torchrl_mcp.runs.builtin import locate
 
 PROGRAM = "torchrl-mcp-export"
@@ -18,6 +18,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Write the policy, and print its difference from torch."""
     options = parser()

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
 PROGRAM = "torchrl-mcp-figures"
@@ -20,6 +20,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()

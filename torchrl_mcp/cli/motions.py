@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.cli.parsing import interruptible, new_parser
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -24,6 +24,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()

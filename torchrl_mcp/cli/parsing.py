@@ -4,7 +4,8 @@ import argparse
 import os
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import wraps
 from importlib.resources import files
 from typing import Any, cast
 
@@ -26,6 +27,19 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
     )
     parser.add_argument("--version", action="version", version=f"{program} {__version__}")
     return parser
+
+
+def interruptible(main: Callable[[], None]) -> Callable[[], None]:
+    """Return the function of a command that ends with a word when it is interrupted, also during its imports."""
+
+    @wraps(main)
+    def run() -> None:
+        try:
+            main()
+        except KeyboardInterrupt:
+            sys.exit("\ninterrupted")
+
+    return run
 
 
 def find_own_modules() -> None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, new_parser
+from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
 
 PROGRAM = "torchrl-mcp-publish"
 
@@ -17,6 +17,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Write the file and its card."""
     arguments = parser().parse_args()

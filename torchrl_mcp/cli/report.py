@@ -6,11 +6,12 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import announce, interruptible, new_parser
 
 PROGRAM = "torchrl-mcp-report"
 
 
+@interruptible
 def main() -> None:
     """Read run folders and write the report."""
     arguments = parser().parse_args()

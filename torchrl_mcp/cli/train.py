@@ -4,7 +4,7 @@ import argparse
 import sys
 from importlib.resources import files
 
-from torchrl_mcp.cli.parsing import add_trust, find_own_modules, new_parser, take_trust
+from torchrl_mcp.cli.parsing import add_trust, find_own_modules, interruptible, new_parser, take_trust
 from torchrl_mcp.training.workers import end_with_parent_while_starting, termination_as_interrupt
 
 end_with_parent_while_starting()  # before the imports that take a worker seconds
@@ -38,6 +38,7 @@ examples:
 """
 
 
+@interruptible
 def main() -> None:
     """Run the command line; if Hydra cannot compose it, say what to write instead."""
     trusted, words = take_trust(sys.argv[1:])

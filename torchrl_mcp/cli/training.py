@@ -49,11 +49,11 @@ def train(cfg: DictConfig) -> float | None:
     A run of a sweep raises what goes wrong, and is continued if it has begun.
     """
     announce(PROGRAM)
-    from torchrl_mcp.cli.summary import final_return, summary
-    from torchrl_mcp.runs import experiment
-
     in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     with _interruptible() if in_sweep else _explained(cfg):
+        from torchrl_mcp.cli.summary import final_return, summary
+        from torchrl_mcp.runs import experiment
+
         begin = experiment.train_or_resume if in_sweep else experiment.train
         folder = _resume(cfg) if cfg.resume else begin(cfg)
     print(summary(folder), flush=True)
