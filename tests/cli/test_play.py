@@ -50,7 +50,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(monkeypatch, tmp_path):
 
 def test_an_unknown_argument_of_the_task_is_refused_by_name(monkeypatch):
     said = refused(monkeypatch, "builtin:biped", "--task", "colour=red")
-    assert "--task colour=red" in said
+    assert "the task has no argument colour: it takes clip_end, clips, " in said
 
 
 def test_a_folder_of_clips_is_refused_with_the_setting_that_takes_one(monkeypatch):

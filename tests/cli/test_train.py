@@ -1,3 +1,4 @@
+import subprocess
 import sys
 from pathlib import Path
 
@@ -125,9 +126,36 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
 @pytest.mark.parametrize(
     ("arguments", "answer"),
     [
+        (["method=mpc"], "there is no method=mpc: did you mean mcp? The choices are finetune, hierarchical, "),
+        (["seed=1,2,3"], "seed=1,2,3 has several values: add --multirun"),
+        (["seed=range(0,3)"], "seed=range(0,3) has several values: add --multirun"),
+        (["hydra/launcher=ray"], "pip install 'torchrl-mcp[ray-launcher]'"),
+        (["run_dir=runs/größe"], """without quotes: write 'run_dir="runs/größe"'"""),
+        (["resume=a=b"], """without quotes: write 'resume="a=b"'"""),
+        (["sead=3"], "the nearest are: seed"),
+    ],
+)
+def test_what_hydra_cannot_compose_is_answered_in_a_line(command, tmp_path, arguments, answer):
+    outcome = command("train", *arguments, cwd=tmp_path)
+    assert outcome.returncode
+    assert answer in outcome.stderr
+    assert len(outcome.stderr.splitlines()) == 1
+
+
+def test_without_assertions_the_remedy_is_said(tmp_path):
+    words = [sys.executable, "-O", "-m", "torchrl_mcp.cli.train", "--multirun", "seed=range(0,2)"]
+    outcome = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert outcome.returncode
+    assert outcome.stderr.splitlines()[-1].endswith("unset PYTHONOPTIMIZE, or drop -O")
+    assert "Traceback" not in outcome.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
         (["benchmark=mixer", "sead=3"], "nearest are: seed"),
-        (["benchmark=mixr"], "exploration\n\tfreeze\n\tmixer"),
-        (["benchmark=mixer", "mixer=aditive"], "additive\n\tmultiplicative"),
+        (["benchmark=mixr"], "did you mean mixer? The choices are exploration, freeze, mixer"),
+        (["benchmark=mixer", "mixer=aditive"], "did you mean additive? The choices are additive, multiplicative"),
         (["benchmark=mixer", "--cfg", "job"], "not --cfg"),
     ],
 )

@@ -95,9 +95,11 @@ def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arg
 
 def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(command, run):
     before = contents(run)
-    outcome = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
-    assert outcome.returncode != 0
-    assert "resume=" in outcome.stderr
+    same = command("train", *FAST, "task.pretrain.max_episode_steps=100", f"run_dir={run}", cwd=run.parents[5])
+    other = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
+    assert same.returncode != 0 != other.returncode
+    assert f"continue it with torchrl-mcp-train resume={run}" in same.stderr
+    assert "holds a run that differs in task: give another run_dir" in other.stderr
     assert contents(run) == before
 
 

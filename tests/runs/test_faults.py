@@ -137,7 +137,7 @@ def test_metrics_that_are_gone_are_named_with_the_remedy(killed):
 
 
 def test_a_disk_that_fills_up_while_the_configuration_is_written_leaves_no_run(tmp_path, monkeypatch):
-    def fill_up(cfg, path, resolve):
+    def fill_up(cfg, path):
         path.write_text("seed: 0\ntrain")
         raise OSError(28, "No space left on device")
 

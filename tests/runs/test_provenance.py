@@ -52,10 +52,12 @@ def test_provenance_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
     monkeypatch.setattr(build.HydraConfig, "initialized", lambda: False)
     command, choices = build.launched()
-    where_from = provenance.provenance("cpu", command, choices, Precision(True, "as measured"))
+    precision, inputs = Precision(True, "as measured"), {"pretrained": "1234abcd"}
+    where_from = provenance.provenance("cpu", command, choices, precision, inputs)
     content = json.loads(json.dumps(where_from))
     assert content["command"] == ["script.py", "seed=3"]
     assert content["precision"] == "networks in bfloat16: as measured"
+    assert content["inputs"] == inputs
     assert content["version"] == __version__
     assert abs((datetime.now(UTC) - datetime.fromisoformat(content["started"])).total_seconds()) < 60
     assert content["machine"]["torch"] == torch.__version__

@@ -111,6 +111,8 @@ def run_benchmark(arguments: list[str]) -> None:
     try:
         with _interruptible():
             benchmark.main(settings)
+    except HydraException:  # some are OSErrors
+        raise
     except (OSError, ValueError) as error:
         sys.exit(f"{PROGRAM}: {error}")
 

@@ -38,9 +38,6 @@ from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.trainer import Trainer
 from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts
 
-MADE_BY_RUNS = {"self", "kwargs", "character", "device", "num_envs", "num_threads", "physics", "pin_memory", "seed"}
-"""Arguments of environments that a run sets itself."""
-
 
 @dataclass(frozen=True)
 class Agent:
@@ -346,7 +343,10 @@ def _require_arguments(name: str, given: Collection[str]) -> None:
         return
     taken = arguments(name)
     if unknown := [argument for argument in given if argument not in taken]:
-        listed = sorted(key for key in taken if key not in MADE_BY_RUNS)
+        base = {*inspect.signature(CharacterEnv.__init__).parameters} - {
+            "max_episode_steps"
+        }  # what tasks set themselves
+        listed = sorted({*taken} - base - {"kwargs", "character"})
         raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 

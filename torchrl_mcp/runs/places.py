@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
+from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
 
 HERE = "."
@@ -19,9 +20,6 @@ HERE = "."
 PRETRAINED = "pretrained"
 NAMES = (PRETRAINED, "path")
 """Names of settings whose value is a file or folder outside the run folder, in any group."""
-
-GET_CLASS = "hydra.utils.get_class"
-"""Hydra's function whose argument ``path`` is the name of a class."""
 
 BUILTIN = "builtin"
 """Value of ``pretrained`` for the networks that come with the library."""

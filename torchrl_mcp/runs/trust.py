@@ -64,8 +64,9 @@ def targets(config: Any) -> Iterator[str]:
 def known() -> frozenset[str]:
     """Return the classes and functions that the files of ``conf`` name."""
     pattern = str(files("torchrl_mcp.conf").joinpath("**/*.yaml"))
-    texts = (Path(path).read_text() for path in glob(pattern, recursive=True))
-    return frozenset(name for text in texts for name in targets(yaml.safe_load(text)))
+    contents = (yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {} for path in glob(pattern, recursive=True))
+    settings = ({key: value for key, value in content.items() if key != "hydra"} for content in contents)
+    return frozenset(name for setting in settings for name in targets(setting))
 
 
 def require_trusted(config: Mapping[str, Any], source: Path) -> None:

@@ -98,5 +98,5 @@ class TrainingBar:
     def _line(self) -> str:
         speed = (self._done - self._first) / (self._told - self._began)
         left = f"{duration(max(self._total - self._done, 0) / speed)} left" if speed else ""
-        parts = [f"{min(self._done, self._total):,} of {self._total:,} steps", f"{speed:,.0f} steps/s", left, self._note]
-        return ", ".join(filter(None, parts))
+        done = f"{min(self._done, self._total):,} of {self._total:,} steps"
+        return ", ".join(filter(None, [done, f"{speed:,.0f} steps/s", left, self._note]))
