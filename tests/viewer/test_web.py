@@ -166,3 +166,9 @@ def test_who_may_what(path, host, origin, address, refused):
     headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
     reason = refusal(path, headers, address)
     assert reason is None if refused is None else refused in reason
+
+
+def test_the_log_has_warnings_alone_while_the_viewer_is_open():
+    with guarded(HERE):
+        assert not web_server.logger.isEnabledFor(logging.INFO)
+    assert web_server.logger.isEnabledFor(logging.INFO)

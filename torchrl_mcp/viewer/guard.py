@@ -4,6 +4,7 @@ Studio listens on every interface, lets the first visitor control the simulation
 setting for any of this (MuJoCo 3.17). This module sets the address to listen on and checks every request.
 """
 
+import logging
 import socket
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -29,7 +30,12 @@ VISITORS = (
 
 @contextmanager
 def guarded(host: str) -> Iterator[None]:
-    """Let viewers that the block opens listen on ``host`` alone, and check requests with :func:`refusal`."""
+    """Let viewers that the block opens listen on ``host`` alone, and check requests with :func:`refusal`.
+
+    The viewer logs warnings alone, not every connection of a browser.
+    """
+    level = web_server.logger.level
+    web_server.logger.setLevel(logging.WARNING)
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
     web_server.serve = partial(_serve, serve)
@@ -37,6 +43,7 @@ def guarded(host: str) -> Iterator[None]:
     try:
         yield
     finally:
+        web_server.logger.setLevel(level)
         web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner = bind, serve, banner
 
 
