@@ -11,7 +11,7 @@ from torchrl_mcp.runs import experiment
 @pytest.fixture(params=["begun", "not begun"])
 def cfg(request, tmp_path):
     if request.param == "begun":
-        (tmp_path / "config.yaml").touch()
+        (tmp_path / "config.yaml").write_text("seed: 0")
     return OmegaConf.create({"resume": None, "run_dir": str(tmp_path)})
 
 

@@ -38,6 +38,14 @@ def test_a_run_ends_with_its_returns_beside_the_papers_and_the_next_commands(fol
     assert commands == [[f"torchrl-mcp-{name}", str(folder)] for name in ("play", "evaluate", "report")]
 
 
+def test_the_next_commands_of_a_run_with_own_code_trust_it(folder):
+    (folder / "config.yaml").write_text(CONFIG + "parts: {_target_: own_parts.parts}\n")
+    play, evaluation, report = summary(folder).splitlines()[-3:]
+    assert play.split() == ["torchrl-mcp-play", "--trust", "own_parts", str(folder)]
+    assert evaluation.split()[1:3] == ["--trust", "own_parts"]
+    assert "--trust" not in report
+
+
 def test_pretraining_has_no_figure_of_the_papers(folder):
     evaluate(folder)
     (folder / "config.yaml").write_text(CONFIG.replace("transfer", "pretrain"))

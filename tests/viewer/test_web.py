@@ -1,4 +1,5 @@
 import contextlib
+import logging
 import math
 import socket
 import threading
@@ -15,8 +16,10 @@ from tensordict.nn import TensorDictModule
 
 pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as MuJoCo 3.17 has it")
 
+from mujoco.experimental.studio.web import web_server
+
 from torchrl_mcp.envs import Heading
-from torchrl_mcp.viewer.guard import refusal
+from torchrl_mcp.viewer.guard import HERE, guarded, refusal
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.steering import Steering
 from torchrl_mcp.viewer.web import KEYS, BrowserEvent, BrowserInput, Pace, StudioApp, play_in_browser

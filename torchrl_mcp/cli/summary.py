@@ -9,13 +9,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.runs import quoting
+from torchrl_mcp.runs.trust import trust_options
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics
 
 
 def summary(folder: Path) -> str:
     """Return the summary of the run in a folder: returns beside the paper's, and the next commands."""
     lines = [f"run folder: {folder}", *_returns(folder), "next:"]
-    lines += [f"  {quoting.command(name, folder)}" for name in ("play", "evaluate", "report")]
+    trust = trust_options(folder / CONFIG)
+    lines += [f"  {quoting.command(name, *trust, folder)}" for name in ("play", "evaluate")]
+    lines.append(f"  {quoting.command('report', folder)}")
     return "\n".join(lines)
 
 

@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from torchrl_mcp.cli.parsing import announce
 from torchrl_mcp.runs import places, quoting
+from torchrl_mcp.runs.trust import resuming
 from torchrl_mcp.training.run_folder import CONFIG
 
 PROGRAM = "torchrl-mcp-train"
@@ -89,7 +90,7 @@ def _what_is_safe(cfg: DictConfig) -> str:
     folder = Path(cfg.resume or cfg.run_dir)
     if not (folder / CONFIG).is_file():
         return "No run has begun: fix the cause and repeat the command"
-    return f"The run is safe up to its last checkpoint in {folder}: go on with {quoting.resuming(folder)}"
+    return f"The run is safe up to its last checkpoint in {folder}: go on with {resuming(folder)}"
 
 
 def run_benchmark(arguments: list[str]) -> None:

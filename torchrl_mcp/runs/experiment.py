@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.runs import build, lock, places, quoting
+from torchrl_mcp.runs import build, lock, places
 from torchrl_mcp.runs.build import make_agent, make_source, make_trainer
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import require_resumable, translated
@@ -16,7 +16,7 @@ from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.policies import evaluation
 from torchrl_mcp.runs.provenance import continuation, provenance
-from torchrl_mcp.runs.trust import read_config, trusting
+from torchrl_mcp.runs.trust import read_config, resuming, trusting
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.metrics import begin_after
 from torchrl_mcp.training.precision import choose, name
@@ -193,7 +193,7 @@ def _require_free(folder: Path, cfg: DictConfig) -> None:
     if (folder / CONFIG).exists():
         changed = changes(folder, build.stored(settled(cfg)))
         held = f"a run that differs in {', '.join(changed)}: " if changed else ""
-        remedy = "" if changed else f"this run already: continue it with {quoting.resuming(folder)}, or "
+        remedy = "" if changed else f"this run already: continue it with {resuming(folder)}, or "
         raise ValueError(f"{folder} holds {held or remedy}give another run_dir")
     if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
         raise ValueError(

@@ -36,8 +36,3 @@ def command(name: str, *words: object) -> str:
     torchrl-mcp-play 'runs/my run'
     """
     return shlex.join([f"torchrl-mcp-{name}", *map(str, words)])
-
-
-def resuming(folder: object, *words: str) -> str:
-    """Return the command that continues the run in a folder, with further settings."""
-    return command("train", setting("resume", folder), *words)

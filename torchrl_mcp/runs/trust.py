@@ -19,6 +19,9 @@ import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_mcp.runs import quoting
+from torchrl_mcp.training.run_folder import CONFIG
+
 LARGEST = 2**20
 """Most bytes of a configuration file. A run's has about ten thousand."""
 
@@ -86,6 +89,18 @@ def require_trusted(config: Mapping[str, Any], source: Path) -> None:
         )
     if any("${" in text for text in _texts(config)):
         raise ValueError(f"{source} holds an interpolation, which training never writes: it was changed, do not use it")
+
+
+def trust_options(path: Path) -> list[str]:
+    """Return the options ``--trust MODULE`` that commands need for the run with a configuration file."""
+    names = [name for name in targets(read_config(path)) if name not in KNOWN]
+    modules = dict.fromkeys(name.rpartition(".")[0] or name for name in names)
+    return [word for module in modules for word in ("--trust", module)]
+
+
+def resuming(run: Path) -> str:
+    """Return the command that continues the run in a folder."""
+    return quoting.command("train", *trust_options(run / CONFIG), quoting.setting("resume", run))
 
 
 def read_config(path: Path) -> dict[str, Any]:
