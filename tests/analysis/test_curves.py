@@ -94,7 +94,7 @@ def test_a_missing_column_is_an_error_that_lists_the_columns(tmp_path):
 
 def test_a_run_without_an_episode_yet_is_an_error(tmp_path):
     run = write_run(tmp_path / "run", [(100, 0, "nan")])
-    with pytest.raises(ValueError, match="let it run until episodes have ended"):
+    with pytest.raises(ValueError, match="let it run until episodes of full length have ended"):
         learning_curves({"mcp": [run]})
 
 

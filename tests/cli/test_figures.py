@@ -76,6 +76,14 @@ def shows_something(stem):
     return imread(f"{stem}.png").std() > 0.01 and Path(f"{stem}.svg").stat().st_size > 1000
 
 
+def test_two_runs_share_a_figure_of_learning_curves(runs, tmp_path, monkeypatch):
+    call(monkeypatch, "curves", runs["mcp"], runs["moe"], "--output", tmp_path)
+    assert shows_something(tmp_path / "curves")
+    found = rows(tmp_path / "curves.csv")
+    assert {row["label"] for row in found} == {"mcp", "moe"}
+    assert max(float(row["mean"]) for row in found) == pytest.approx(0.3)
+
+
 def test_exploration_has_a_panel_per_checkpoint_and_one_of_noise(runs, tmp_path, monkeypatch, capsys):
     checkpoints = [runs[name] for name in ("mcp", "moe", "latent", "sequence", "options")]
     call(monkeypatch, "exploration", *checkpoints, "--trajectories", 3, "--seconds", 0.5, "--output", tmp_path)

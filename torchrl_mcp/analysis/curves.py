@@ -138,7 +138,7 @@ def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
     points = [(row["frames"], row[quantity], row[weight] if weight else 1.0) for row in rows]
     points = [point for point in points if math.isfinite(point[1])]
     if not points:
-        raise ValueError(f"{run} has no finite {quantity!r} yet: let it run until episodes have ended")
+        raise ValueError(f"{run} has no finite {quantity!r} yet: let it run until episodes of full length have ended")
     frames, values, weights = np.array(points).T
     return frames, values, weights
 

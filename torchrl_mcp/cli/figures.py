@@ -14,6 +14,7 @@ A CHECKPOINT is a run folder (its newest checkpoint), a checkpoint file, or {PRE
 the library.
 
 examples:
+  {PROGRAM} curves runs/first runs/second                       # learning curves in one figure
   {PROGRAM} holdout runs/holdout/*                              # Figure 5
   {PROGRAM} exploration {PREFIX}humanoid runs/latent-humanoid   # Figure 6
   {PROGRAM} primitives {PREFIX}biped {PREFIX}humanoid          # Figure 7
@@ -49,6 +50,8 @@ def parser() -> argparse.ArgumentParser:
     add_trust(shared)
     shared.add_argument("--seed", type=int, default=0, help="seed of environments and random numbers (default 0)")
 
+    command = commands.add_parser("curves", parents=[shared], help="learning curves of run folders in one figure")
+    command.set_defaults(draw="curves")
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")
     command.set_defaults(draw="holdout")
     command = commands.add_parser("exploration", parents=[shared], help="Figure 6: paths of random exploration")

@@ -49,6 +49,13 @@ def holdout(arguments: argparse.Namespace) -> None:
         write_curves(curves, arguments.output / "holdout_curves.csv")
 
 
+def curves(arguments: argparse.Namespace) -> None:
+    """Draw the learning curves of runs in one figure."""
+    lines = learning_curves({name: [path] for name, path in _named(arguments.checkpoints)})
+    _save(draw_curves(lines), arguments.output / "curves")
+    write_curves(lines, arguments.output / "curves.csv")
+
+
 def explore(arguments: argparse.Namespace) -> None:
     """Draw Figure 6: paths of random exploration, by method."""
     panels, character = _explored(arguments)
