@@ -106,9 +106,16 @@ def task_settings(words: list[str]) -> dict[str, Any]:
 
 def _task_arguments() -> Iterator[tuple[str, list[str]]]:
     """Yield each task with its arguments, from its evaluation in ``conf/task``."""
-    for file in sorted(files("torchrl_mcp.conf").joinpath("task").iterdir(), key=lambda file: file.name):
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-        yield content["name"], sorted(content["evaluation"])
+    conf = files("torchrl_mcp.conf")
+
+    def settings(name: str) -> dict[str, Any]:
+        return yaml.safe_load(conf.joinpath(f"{name}.yaml").read_text(encoding="utf-8"))
+
+    for name in sorted(file.name.removesuffix(".yaml") for file in conf.joinpath("task").iterdir()):
+        content = settings(f"task/{name}")
+        shared = [entry[1:].partition("@")[0] for entry in content["defaults"] if str(entry).startswith("/")]
+        parts = [content.get("task", content), *map(settings, shared)]
+        yield name, sorted(argument for part in parts for argument in part["evaluation"])
 
 
 def announce(program: str) -> None:

@@ -93,7 +93,7 @@ def require_trusted(config: Mapping[str, Any], source: Path) -> None:
 
 def trust_options(path: Path) -> list[str]:
     """Return the options ``--trust MODULE`` that commands need for the run with a configuration file."""
-    names = [name for name in targets(read_config(path)) if name not in KNOWN]
+    names = [name for name in targets(read_config(path)) if name not in known()]
     modules = dict.fromkeys(name.rpartition(".")[0] or name for name in names)
     return [word for module in modules for word in ("--trust", module)]
 
