@@ -7,6 +7,9 @@ import argparse
 from pathlib import Path
 
 import matplotlib.image
+import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
+
+# isort: split
 import mujoco
 import numpy as np
 

@@ -32,6 +32,9 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
 
+import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
+
+# isort: split
 import mujoco
 import torch
 from report import about, table, write

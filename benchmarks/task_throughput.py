@@ -28,6 +28,9 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
+
+# isort: split
 import mujoco
 import numpy as np
 import torch

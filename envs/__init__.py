@@ -6,6 +6,10 @@ if __name__ != "torchrl_mcp.envs":
         "(install it with `pip install -e .` and use the full name)"
     )
 
+# Before mujoco: with triton, which a CUDA build of torch brings and tensordict imports, the process would crash if
+# MuJoCo had loaded OSMesa first (MUJOCO_GL=osmesa).
+import tensordict  # noqa: F401
+
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.pd_character import PDCharacterEnv

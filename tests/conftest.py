@@ -8,6 +8,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
+import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings

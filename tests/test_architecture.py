@@ -143,3 +143,24 @@ def test_the_library_imports_without_hydra_and_leaves_scipy_to_the_functions_tha
     run = subprocess.run([sys.executable, "-c", code, *library], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert int(run.stdout) == len(library) > 80
+
+
+def imports_of_mujoco():
+    """Modules that import MuJoCo: of a folder that imports tensordict first, one."""
+    using = [name for name in MODULES if any(other.split(".")[0] == "mujoco" for other in IMPORTS[name])]
+    firsts = {f"torchrl_mcp.{folder(name)}": name for name in using if name not in OF_EXTRAS}
+    guarded = {package for package in firsts if "tensordict" in IMPORTS[package]}
+    return [name for name in using if f"torchrl_mcp.{folder(name)}" not in guarded] + [firsts[name] for name in guarded]
+
+
+@pytest.mark.parametrize("name", sorted(imports_of_mujoco()))
+def test_tensordict_and_with_it_triton_is_imported_before_mujoco(name):
+    code = (
+        "import importlib, sys\n"
+        "importlib.import_module(sys.argv[1])\n"
+        "print(*[name for name in sys.modules if name in ('triton', 'tensordict', 'mujoco')])"
+    )
+    run = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, check=True)
+    loaded = run.stdout.split()
+    assert loaded[-1] == "mujoco"
+    assert "tensordict" in loaded

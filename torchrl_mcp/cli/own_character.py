@@ -4,6 +4,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
+
+# isort: split
 import mujoco
 
 from torchrl_mcp.envs.characters.adapt import adapted, key_bodies
