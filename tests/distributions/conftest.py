@@ -29,7 +29,7 @@ def assert_same():
     """Compare the densities, means and deviations of two distributions."""
 
     def assert_same(p, q):
-        action = torch.randn(20, *p.batch_shape, *p.event_shape, dtype=torch.float64)
+        action = p.sample((20,))
         torch.testing.assert_close(p.log_prob(action), q.log_prob(action))
         torch.testing.assert_close(p.mean, q.mean)
         torch.testing.assert_close(p.stddev, q.stddev)

@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from torch.distributions import Independent, Normal
+from torch.distributions import Independent, Normal, kl_divergence
 
 from torchrl_mcp.distributions import AdditiveGaussian
 
@@ -160,3 +160,31 @@ def test_a_primitive_with_a_subnormal_gate_counts_where_it_alone_explains_the_ac
 def test_the_mode_is_refused_with_the_remedy():
     with pytest.raises(NotImplementedError, match="deterministic_sample"):
         _ = AdditiveGaussian(*random_primitives()).mode
+
+
+def test_rsample_is_refused_with_the_limit_and_the_remedy():
+    policy = AdditiveGaussian(*random_primitives())
+    assert not policy.has_rsample
+    with pytest.raises(NotImplementedError, match=r"comes from one primitive.*PPO.*SAC.*TanhMultiplicativeGaussian"):
+        policy.rsample()
+
+
+@pytest.mark.parametrize("action_dim", [1, 2])
+def test_kl_divergence_has_the_value_and_the_gradient_of_the_integral(action_dim):
+    torch.manual_seed(0)
+    first = [x.requires_grad_() for x in random_primitives(action_dim=action_dim, seed=1)]
+    second = [x.requires_grad_() for x in random_primitives(num_primitives=2, action_dim=action_dim, seed=2)]
+    actions, cell = actions_on_a_grid(action_dim), (GRID[1] - GRID[0]) ** action_dim
+    p, q = mixture_density(actions, *first), mixture_density(actions, *second)
+    exact = (torch.special.xlogy(p, p) - torch.special.xlogy(p, q)).sum() * cell
+    estimate = kl_divergence(AdditiveGaussian(*first).expand((20_000,)), AdditiveGaussian(*second)).mean()
+    torch.testing.assert_close(estimate, exact, atol=0, rtol=0.02)
+    for ours, true in zip(
+        torch.autograd.grad(estimate, first + second), torch.autograd.grad(exact, first + second), strict=True
+    ):
+        torch.testing.assert_close(ours, true, atol=0.05, rtol=0.05)
+
+
+def test_kl_divergence_broadcasts_and_is_zero_to_itself():
+    policy = AdditiveGaussian(*random_primitives(5))
+    torch.testing.assert_close(kl_divergence(policy, policy.expand((2, 5))), torch.zeros(2, 5, dtype=torch.float64))

@@ -6,15 +6,19 @@ import pytest
 import torch
 from tensordict.nn import InteractionType, TensorDictModule, TensorDictSequential
 from torch import nn
-from torch.distributions import AffineTransform, TanhTransform, TransformedDistribution
 from torchrl.envs import ExplorationType, GymEnv, GymWrapper, set_exploration_type
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
-from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss, SACLoss, SoftUpdate
+from torchrl.objectives import A2CLoss, ClipPPOLoss, CrossQLoss, KLPENPPOLoss, REDQLoss, SACLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
-from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian, TanhMultiplicativeGaussian
 
 both = pytest.mark.parametrize("distribution_class", [MultiplicativeGaussian, AdditiveGaussian])
+all_three = pytest.mark.parametrize(
+    "distribution_class", [MultiplicativeGaussian, AdditiveGaussian, TanhMultiplicativeGaussian]
+)
+TORQUE = {"low": -2.0, "high": 2.0}
+"""Bounds of the pendulum's action."""
 
 
 class Primitives(nn.Module):
@@ -29,7 +33,7 @@ class Primitives(nn.Module):
         return self.loc(observation).unflatten(-1, self.shape), self.scale(observation).unflatten(-1, self.shape) + 0.1
 
 
-def make_actor(distribution, observation_dim=3, action_dim=1):
+def make_actor(distribution, observation_dim=3, action_dim=1, **kwargs):
     gate = nn.Sequential(nn.Linear(observation_dim, 32), nn.Tanh(), nn.Linear(32, 4), nn.Sigmoid())
     return ProbabilisticActor(
         TensorDictSequential(
@@ -38,6 +42,7 @@ def make_actor(distribution, observation_dim=3, action_dim=1):
         ),
         in_keys=["loc", "scale", "gates"],
         distribution_class=distribution,
+        distribution_kwargs=kwargs,
         return_log_prob=True,
         default_interaction_type=InteractionType.RANDOM,
     )
@@ -74,7 +79,7 @@ def env():
     env.close()
 
 
-@both
+@all_three
 @pytest.mark.parametrize("loss_class", [ClipPPOLoss, KLPENPPOLoss, A2CLoss])
 def test_it_trains_in_a_stock_on_policy_agent(env, distribution_class, loss_class):
     actor, critic = make_actor(distribution_class), make_critic()
@@ -107,7 +112,13 @@ def test_the_policy_ratio_is_one_until_the_first_update(env, distribution_class)
     assert losses["max_ratio"] == losses["mean_ratio"] == 1
 
 
-@both
+def test_the_policy_ratio_of_a_squashed_product_is_one_up_to_the_rounding_of_actions(env):
+    actor, critic = make_actor(TanhMultiplicativeGaussian, **TORQUE), make_critic()
+    losses = ClipPPOLoss(actor, critic)(collect(env, actor, critic))
+    torch.testing.assert_close(losses["max_ratio"], torch.tensor(1.0), atol=1e-3, rtol=0)
+
+
+@all_three
 def test_the_entropy_bonus_is_our_own_and_not_torchrl_s_sampled_one(env, distribution_class, monkeypatch):
     actor, critic = make_actor(distribution_class), make_critic()
     batch = collect(env, actor, critic)
@@ -115,7 +126,7 @@ def test_the_entropy_bonus_is_our_own_and_not_torchrl_s_sampled_one(env, distrib
     assert ClipPPOLoss(actor, critic)(batch)["entropy"] == 7
 
 
-@both
+@all_three
 def test_exploration_off_plays_the_deterministic_sample(env, distribution_class):
     actor = make_actor(distribution_class)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -124,28 +135,34 @@ def test_exploration_off_plays_the_deterministic_sample(env, distribution_class)
     assert torch.equal(step["action"], expected)
 
 
-def squashed(loc, scale, gates):
-    """Pendulum's torque lies in (-2, 2)."""
-    return TransformedDistribution(
-        MultiplicativeGaussian(loc, scale, gates), [TanhTransform(cache_size=1), AffineTransform(0, 2)]
-    )
+def make_action_value():
+    return ValueOperator(MLP(in_features=4, out_features=1, num_cells=[32]), in_keys=["observation", "action"])
 
 
-def test_the_product_trains_in_a_stock_soft_actor_critic(env):
-    actor = make_actor(squashed)
-    critic = ValueOperator(MLP(in_features=4, out_features=1, num_cells=[32]), in_keys=["observation", "action"])
-    loss_module = SACLoss(actor, critic, action_spec=env.action_spec)
+@pytest.mark.parametrize("bounds", [TORQUE, {name: torch.tensor([bound]) for name, bound in TORQUE.items()}])
+@pytest.mark.parametrize("loss_class", [SACLoss, REDQLoss])
+def test_the_squashed_product_trains_in_a_stock_off_policy_agent(env, loss_class, bounds):
+    actor = make_actor(TanhMultiplicativeGaussian, **bounds)
+    loss_module = loss_class(actor, make_action_value(), action_spec=env.action_spec)
     loss_module.make_value_estimator(gamma=0.95)
     target_updater = SoftUpdate(loss_module, eps=0.99)
     optimizer = torch.optim.Adam(loss_module.parameters(), lr=1e-3)
     with torch.no_grad():
         batch = env.rollout(64, actor)
-    assert (batch["action"].abs() < 2).all()
+    assert env.action_spec.is_in(batch["action"])
     for _ in range(3):
         optimizer.zero_grad()
         assert_the_loss_trains_gates_and_primitives(loss_module(batch), actor)
         optimizer.step()
         target_updater.step()
+
+
+@pytest.mark.parametrize("loss_class", [SACLoss, REDQLoss, CrossQLoss])
+def test_a_loss_that_differentiates_samples_refuses_the_mixture_with_the_remedy(env, loss_class):
+    loss_module = loss_class(make_actor(AdditiveGaussian), make_action_value(), action_spec=env.action_spec)
+    loss_module.make_value_estimator(gamma=0.95)
+    with pytest.raises(NotImplementedError, match="TanhMultiplicativeGaussian"):
+        loss_module(env.rollout(8, env.rand_action))
 
 
 class Follow(gymnasium.Env):

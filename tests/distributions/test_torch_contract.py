@@ -5,6 +5,14 @@ import pickle
 
 import pytest
 import torch
+from torch.export import Dim, export
+
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian, TanhMultiplicativeGaussian
+
+
+@pytest.fixture(params=[MultiplicativeGaussian, AdditiveGaussian, TanhMultiplicativeGaussian])
+def distribution_class(request):
+    return request.param
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 5)])
@@ -17,6 +25,33 @@ def test_shapes_are_torch_s(distribution_class, batch, random_primitives):
     assert policy.entropy().shape == batch
     for statistic in (policy.mean, policy.variance, policy.stddev, policy.deterministic_sample):
         assert statistic.shape == (*batch, 3)
+
+
+def test_the_primitives_and_gates_are_attributes(distribution_class, random_primitives):
+    loc, scale, gates = random_primitives(5)
+    policy = distribution_class(loc, scale[0, :, :1], gates)
+    assert torch.equal(policy.loc, loc)
+    assert torch.equal(policy.scale, scale[0, :, :1].expand(5, 3, 2))
+    assert torch.equal(policy.gates, gates)
+
+
+def test_it_prints_its_name_and_shapes(distribution_class, random_primitives):
+    expected = f"{distribution_class.__name__}(loc (5, 3, 2), scale (5, 3, 2), gates (5, 3))"
+    assert repr(distribution_class(*random_primitives(5))) == expected
+
+
+def test_a_number_is_the_same_scale_for_all_primitives_and_actions(distribution_class, random_primitives):
+    loc, scale, gates = random_primitives(5)
+    policy, expected = (distribution_class(loc, value, gates) for value in (0.7, torch.full_like(scale, 0.7)))
+    assert torch.equal(policy.stddev, expected.stddev)
+    half = distribution_class(loc.bfloat16(), 0.7, gates.bfloat16())
+    assert torch.equal(half.scale, torch.full((5, 3, 2), 0.7))  # not rounded to bfloat16
+
+
+@pytest.mark.parametrize("name", ["cdf", "icdf"])
+def test_a_cumulative_distribution_is_refused_with_the_remedy(distribution_class, name, random_primitives):
+    with pytest.raises(NotImplementedError, match=f"{distribution_class.__name__} has no {name}.*samples"):
+        getattr(distribution_class(*random_primitives()), name)(torch.zeros(2))
 
 
 def test_a_batch_equals_its_rows_one_by_one(distribution_class, random_primitives):
@@ -80,6 +115,8 @@ def test_an_expanded_distribution_is_itself_over_a_larger_batch(distribution_cla
     assert expanded.batch_shape == (2, 5)
     assert expanded.sample().shape == expanded.deterministic_sample.shape == (2, 5, 2)
     assert expanded.entropy().shape == (2, 5)
+    assert expanded.loc.shape == expanded.scale.shape == (2, 5, 3, 2)
+    assert torch.equal(expanded.gates, policy.gates.expand(2, 5, 3))
     action = policy.sample()
     torch.testing.assert_close(expanded.log_prob(action), policy.log_prob(action).expand(2, 5))
 
@@ -108,6 +145,7 @@ def test_it_compiles_into_one_graph(distribution_class, backend, random_primitiv
         assert policy.sample().shape == (*policy.expand((2, 5)).entropy().shape[1:], 2)
         return sum(x.sum() for x in evaluate(distribution_class, loc, scale, gates, action))
 
+    torch.compiler.reset()
     *primitives, action = *random_primitives(5), torch.zeros(5, 2)
     gradients = []
     for function in (loss, torch.compile(loss, fullgraph=True, backend=backend)):
@@ -129,3 +167,25 @@ def test_it_works_under_vmap_and_functional_grad(distribution_class, validate_ar
     expected = torch.autograd.grad(outputs(*inputs, action)[0].sum(), inputs)
     per_row = torch.func.vmap(torch.func.grad(lambda *args: outputs(*args)[0], argnums=(0, 1, 2)))
     torch.testing.assert_close(per_row(*primitives, action), expected)
+
+
+class Evaluated(torch.nn.Module):
+    """The numbers of a policy as a module, which is what torch.export takes."""
+
+    def __init__(self, distribution_class):
+        super().__init__()
+        self.distribution_class = distribution_class
+
+    def forward(self, loc, scale, gates, action):
+        return evaluate(self.distribution_class, loc, scale, gates, action)
+
+
+def test_it_exports_with_any_batch_size(distribution_class, random_primitives):
+    module, batch = Evaluated(distribution_class), Dim("batch")
+
+    def inputs(size):
+        return *random_primitives(size), torch.zeros(size, 2, dtype=torch.float64)
+
+    exported = export(module, inputs(4), dynamic_shapes=[{0: batch}] * 4).module()
+    for size in (2, 7):
+        torch.testing.assert_close(exported(*inputs(size)), module(*inputs(size)))

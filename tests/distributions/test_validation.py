@@ -1,16 +1,31 @@
-"""Bad arguments and actions are refused where validation is on, and checks cost nothing where it is off."""
+"""Bad shapes are always refused, bad values where validation is on, and checks cost nothing where it is off."""
 
 import pytest
 import torch
 from torch.distributions import Distribution
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian, TanhMultiplicativeGaussian
 
-BAD_ARGUMENTS = {
+
+@pytest.fixture(params=[MultiplicativeGaussian, AdditiveGaussian, TanhMultiplicativeGaussian])
+def distribution_class(request):
+    return request.param
+
+
+BAD_SHAPES = {
     "scale of another length": ({"scale": torch.ones(3, 5)}, r"loc \(3, 2\), scale \(3, 5\).* do not broadcast.*\*B"),
     "gates of another length": ({"gates": torch.ones(4)}, r"gates \(4,\) do not broadcast.*\(\*B, K\)"),
     "no primitive dimension": ({"loc": torch.zeros(2)}, r"loc \(2,\).* lack a dimension for the primitives"),
+    "gates without a dimension": ({"gates": torch.tensor(1.0)}, r"gates \(\) lack a dimension for the primitives"),
+    "one gate for all": ({"gates": torch.ones(1)}, r"gates \(1,\) do not have a gate for each primitive"),
+    "gates with one dimension more": (
+        {"loc": torch.zeros(5, 3, 2), "gates": torch.ones(5, 1, 3)},
+        r"loc \(5, 3, 2\), scale \(3, 2\), gates \(5, 1, 3\) have different batch shapes.* batch of \(5, 5\)",
+    ),
+}
+
+BAD_VALUES = {
     "negative gates": ({"gates": torch.tensor([1.0, -0.5, 1.0])}, r"gates of shape \(3,\) holds -0\.5.*sigmoid"),
     "NaN gates": ({"gates": torch.tensor([1.0, torch.nan, 1.0])}, r"gates of shape \(3,\) holds nan.*sigmoid"),
     "infinite gates": ({"gates": torch.tensor([1.0, torch.inf, 1.0])}, r"gates of shape \(3,\) holds inf"),
@@ -21,8 +36,16 @@ BAD_ARGUMENTS = {
 }
 
 
-@pytest.mark.parametrize(("bad", "message"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS.keys())
-def test_bad_arguments_are_named_with_their_remedy(distribution_class, bad, message):
+@pytest.mark.parametrize("validate_args", [True, False])
+@pytest.mark.parametrize(("bad", "message"), BAD_SHAPES.values(), ids=BAD_SHAPES.keys())
+def test_bad_shapes_are_always_named_with_their_remedy(distribution_class, bad, message, validate_args):
+    good = {"loc": torch.zeros(3, 2), "scale": torch.ones(3, 2), "gates": torch.ones(3)}
+    with pytest.raises(ValueError, match=message):
+        distribution_class(**good | bad, validate_args=validate_args)
+
+
+@pytest.mark.parametrize(("bad", "message"), BAD_VALUES.values(), ids=BAD_VALUES.keys())
+def test_bad_values_are_named_with_their_remedy(distribution_class, bad, message):
     good = {"loc": torch.zeros(3, 2), "scale": torch.ones(3, 2), "gates": torch.ones(3)}
     with pytest.raises(ValueError, match=message):
         distribution_class(**good | bad, validate_args=True)
@@ -34,6 +57,38 @@ def test_a_mixture_refuses_gates_that_are_all_zero_and_a_product_does_not():
     with pytest.raises(ValueError, match=r"gates of shape \(2, 2\) hold a row of zeros.*softmax"):
         AdditiveGaussian(*primitives, gates, validate_args=True)
     MultiplicativeGaussian(*primitives, gates, validate_args=True)
+
+
+@pytest.mark.parametrize("validate_args", [True, False])
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        (1.0, -1.0, r"low=1\.0 is not below high=-1\.0"),
+        (0.0, 0.0, r"low=0\.0 is not below high=0\.0"),
+        (
+            torch.zeros(5, 2),
+            torch.ones(5, 2),
+            r"\(5, 2\).* do not fit 2 actions: pass numbers or tensors of shape \(A,\)",
+        ),
+        (torch.zeros(3), 1.0, r"\(3,\).* do not fit 2 actions"),
+    ],
+)
+def test_bad_bounds_are_named_with_their_remedy(low, high, message, validate_args, random_primitives):
+    with pytest.raises(ValueError, match=message):
+        TanhMultiplicativeGaussian(*random_primitives(), low, high, validate_args=validate_args)
+
+
+def test_the_values_of_bounds_are_checked_when_validation_is_on(random_primitives):
+    low, high = torch.tensor([-1.0, 2.0]), torch.tensor([1.0, 1.0])
+    with pytest.raises(ValueError, match="is not below high"):
+        TanhMultiplicativeGaussian(*random_primitives(), low, high, validate_args=True)
+
+
+@pytest.mark.parametrize("action", [-1.5, 1.5])
+def test_an_action_outside_the_bounds_is_refused_when_validation_is_on(action, random_primitives):
+    policy = TanhMultiplicativeGaussian(*random_primitives(), validate_args=True)
+    with pytest.raises(ValueError, match="value"):
+        policy.log_prob(torch.tensor([0.0, action]))
 
 
 def test_a_bad_action_is_refused_when_validation_is_on(distribution_class, random_primitives):

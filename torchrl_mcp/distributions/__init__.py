@@ -2,5 +2,6 @@
 
 from torchrl_mcp.distributions.additive import AdditiveGaussian
 from torchrl_mcp.distributions.multiplicative import MultiplicativeGaussian
+from torchrl_mcp.distributions.squashed import TanhMultiplicativeGaussian
 
-__all__ = ["AdditiveGaussian", "MultiplicativeGaussian"]
+__all__ = ["AdditiveGaussian", "MultiplicativeGaussian", "TanhMultiplicativeGaussian"]

@@ -1,20 +1,21 @@
 """The additive composition of Gaussian primitives (Eq. 1): a mixture of experts."""
 
 import math
-from typing import Self
+from collections.abc import Callable, Sequence
+from typing import NoReturn, Self
 
 import torch
 from torch import Size, Tensor
-from torch.distributions import Categorical, Distribution, Independent, MixtureSameFamily, Normal
+from torch.distributions import Categorical, Distribution, Independent, MixtureSameFamily, Normal, register_kl
 
-from torchrl_mcp.distributions.multiplicative import broadcast_primitives
+from torchrl_mcp.distributions.primitives import GatedPrimitives, broadcast_primitives
 
 # Normalising multiplies the gradient by 1 / sum(w), on top of log-densities that reach 1e17 when narrow primitives meet
 # wide ones: the product must stay in float32. The sum of softmax gates or of open sigmoid gates is far above.
 GATES_FLOOR = 1e-8
 
 
-class AdditiveGaussian(MixtureSameFamily):
+class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
     r"""Mixture of :math:`K` diagonal Gaussians: a primitive is drawn, then an action from it.
 
     .. math:: \pi(a) = \sum_{k=1}^K \bar w_k \, \mathcal{N}(a; \mu_k, \sigma_k^2), \qquad
@@ -26,14 +27,14 @@ class AdditiveGaussian(MixtureSameFamily):
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, shape ``(*B, K, A)``, positive; the paper writes its
+        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive; the paper writes its
             variance as :math:`\sigma`, without the square.
         gates: Weights, shape ``(*B, K)``, non-negative and not all zero; they are normalised to sum to one.
-        validate_args: Whether to check the arguments; ``None`` follows torch's default, which importing TorchRL
-            switches off.
+        validate_args: Whether to check values; ``None`` follows torch's default, which importing TorchRL switches off.
+            Shapes are always checked.
 
     Raises:
-        ValueError: If validation is on and the shapes do not broadcast, ``loc`` is not finite, ``scale`` is not
+        ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
             positive and finite, or ``gates`` are negative, not finite or all zero.
 
     Reference:
@@ -47,8 +48,9 @@ class AdditiveGaussian(MixtureSameFamily):
         (tensor([1.]), tensor([4.]), tensor([0.]))
     """
 
-    def __init__(self, loc: Tensor, scale: Tensor, gates: Tensor, validate_args: bool | None = None) -> None:
+    def __init__(self, loc: Tensor, scale: Tensor | float, gates: Tensor, validate_args: bool | None = None) -> None:
         loc, scale, gates = broadcast_primitives(loc, scale, gates, validate_args)
+        self.loc, self.scale, self.gates = loc, scale, gates
         total = gates.sum(-1, keepdim=True)
         gates = gates + (GATES_FLOOR - total).clamp_min(0) / gates.shape[-1]
         super().__init__(
@@ -64,7 +66,9 @@ class AdditiveGaussian(MixtureSameFamily):
 
     def expand(self, batch_shape: Size | list[int] | tuple[int, ...], _instance: Distribution | None = None) -> Self:
         """Return the same distribution over a larger batch, without copying."""
-        return super().expand(batch_shape, self._get_checked_instance(AdditiveGaussian, _instance))
+        new = super().expand(batch_shape, self._get_checked_instance(AdditiveGaussian, _instance))
+        new._expand_primitives(self)
+        return new
 
     def log_prob(self, value: Tensor) -> Tensor:
         r"""Return :math:`\log \sum_k \bar w_k \mathcal{N}(a; \mu_k, \sigma_k^2)`.
@@ -106,9 +110,25 @@ class AdditiveGaussian(MixtureSameFamily):
         Returns:
             Entropy estimates, shape ``(*B,)``.
         """
+        return -self._expectation(self.log_prob, num_samples)
+
+    def _expectation(self, function: Callable[[Tensor], Tensor], num_samples: int = 1) -> Tensor:
+        """Estimate the mean of a function of actions, exactly over primitives and reparametrised within each."""
         actions = self.component_distribution.rsample((num_samples,)).movedim(-2, 0)
         gates = self.mixture_distribution.probs.movedim(-1, 0).unsqueeze(1)
-        return -(gates * self.log_prob(actions)).sum(0).mean(0)
+        return (gates * function(actions)).sum(0).mean(0)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> NoReturn:
+        """Raise an error: which primitive a sample comes from has no derivative.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError(
+            "AdditiveGaussian cannot differentiate its samples, because each comes from one primitive: use a loss of "
+            "log-probabilities, such as PPO or A2C, or, for SAC and other losses that call rsample, "
+            "TanhMultiplicativeGaussian or MultiplicativeGaussian"
+        )
 
     @property
     def mode(self) -> Tensor:
@@ -126,4 +146,13 @@ class AdditiveGaussian(MixtureSameFamily):
     def deterministic_sample(self) -> Tensor:
         """The mean of the most likely primitive, shape ``(*B, A)``; the mixture's mean may lie between modes."""
         index = self.mixture_distribution.probs.argmax(-1)[..., None, None]
-        return torch.take_along_dim(self.component_distribution.mean, index, dim=-2).squeeze(-2)
+        # Not take_along_dim, which torch.export would restrict to the batch size of its example.
+        return self.loc.gather(-2, index.expand(*self.batch_shape, 1, *self.event_shape)).squeeze(-2)
+
+
+@register_kl(AdditiveGaussian, AdditiveGaussian)
+def _kl_additive_additive(p: AdditiveGaussian, q: AdditiveGaussian) -> Tensor:
+    """Estimate the divergence like :meth:`AdditiveGaussian.entropy`, by one sample of noise per primitive."""
+    shape = torch.broadcast_shapes(p.batch_shape, q.batch_shape)
+    p, q = p.expand(shape), q.expand(shape)
+    return p._expectation(lambda action: p.log_prob(action) - q.log_prob(action))

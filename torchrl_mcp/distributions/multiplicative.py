@@ -1,12 +1,12 @@
-"""The multiplicative composition of Gaussian primitives (Eq. 3), and the checks it shares with the additive one."""
+"""The multiplicative composition of Gaussian primitives (Eq. 3)."""
 
 import math
-from functools import reduce
 from typing import Self
 
-import torch
 from torch import Size, Tensor
 from torch.distributions import Distribution, Independent, Normal
+
+from torchrl_mcp.distributions.primitives import GatedPrimitives, broadcast_primitives
 
 # The composite standard deviation when no primitive acts. It is far above any useful action scale (a primitive of
 # scale 1e3 still reaches it only below a gate of 0.01), and low enough that 6-sigma samples stay finite in float16
@@ -15,7 +15,7 @@ MAX_SCALE = 1e4
 LOG_PRECISION_FLOOR = -2 * math.log(MAX_SCALE)
 
 
-class MultiplicativeGaussian(Independent):
+class MultiplicativeGaussian(GatedPrimitives, Independent):
     r"""Weighted product of :math:`K` diagonal Gaussians, renormalised: itself a diagonal Gaussian.
 
     .. math::
@@ -35,14 +35,14 @@ class MultiplicativeGaussian(Independent):
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, shape ``(*B, K, A)``, positive; the paper writes its
+        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive; the paper writes its
             variance as :math:`\sigma`, without the square.
         gates: Weights, shape ``(*B, K)``, non-negative; they need not sum to one.
-        validate_args: Whether to check the arguments; ``None`` follows torch's default, which importing TorchRL
-            switches off.
+        validate_args: Whether to check values; ``None`` follows torch's default, which importing TorchRL switches off.
+            Shapes are always checked.
 
     Raises:
-        ValueError: If validation is on and the shapes do not broadcast, ``loc`` is not finite, ``scale`` is not
+        ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
             positive and finite, or ``gates`` are negative or not finite.
 
     Reference:
@@ -56,8 +56,9 @@ class MultiplicativeGaussian(Independent):
         (tensor([1.5000]), tensor([1.]))
     """
 
-    def __init__(self, loc: Tensor, scale: Tensor, gates: Tensor, validate_args: bool | None = None) -> None:
+    def __init__(self, loc: Tensor, scale: Tensor | float, gates: Tensor, validate_args: bool | None = None) -> None:
         loc, scale, gates = broadcast_primitives(loc, scale, gates, validate_args)
+        self.loc, self.scale, self.gates = loc, scale, gates
         gates = gates.unsqueeze(-1)
         log_precision = -2 * scale.log()
         # log sum_k w_k exp(x_k) around an anchor that cancels: unlike logsumexp(log w + x), it has a gradient at w = 0.
@@ -71,61 +72,11 @@ class MultiplicativeGaussian(Independent):
 
     def expand(self, batch_shape: Size | list[int] | tuple[int, ...], _instance: Distribution | None = None) -> Self:
         """Return the same distribution over a larger batch, without copying."""
-        return super().expand(batch_shape, self._get_checked_instance(MultiplicativeGaussian, _instance))
+        new = super().expand(batch_shape, self._get_checked_instance(MultiplicativeGaussian, _instance))
+        new._expand_primitives(self)
+        return new
 
     @property
     def deterministic_sample(self) -> Tensor:
         """The mean, shape ``(*B, A)``, which TorchRL plays when exploration is off."""
         return self.mean
-
-
-def broadcast_primitives(
-    loc: Tensor, scale: Tensor, gates: Tensor, validate_args: bool | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Bring primitives and gates to one floating-point type and batch shape, after checking them if asked to.
-
-    Args:
-        loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, shape ``(*B, K, A)``.
-        gates: Weights, shape ``(*B, K)``.
-        validate_args: Whether to check; ``None`` follows torch's default.
-
-    Returns:
-        ``loc``, ``scale`` and ``gates`` in the widest of their types, ``float32`` at least.
-
-    Raises:
-        ValueError: If validation is on and an argument is malformed.
-    """
-    if Distribution._validate_args if validate_args is None else validate_args:
-        check_primitives(loc, scale, gates)
-    dtype = reduce(torch.promote_types, (loc.dtype, scale.dtype, gates.dtype), torch.float32)
-    shape = torch.broadcast_shapes(loc.shape, scale.shape, (*gates.shape, 1))
-    return loc.to(dtype).expand(shape), scale.to(dtype).expand(shape), gates.to(dtype).expand(shape[:-1])
-
-
-def check_primitives(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
-    """Check that primitives and gates make a distribution.
-
-    Args:
-        loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, shape ``(*B, K, A)``.
-        gates: Weights, shape ``(*B, K)``.
-
-    Raises:
-        ValueError: If not, with the argument, its value or shape, and the remedy.
-    """
-    shapes = f"loc {tuple(loc.shape)}, scale {tuple(scale.shape)} and gates {tuple(gates.shape)}"
-    remedy = "pass loc and scale of shape (*B, K, A) and gates of shape (*B, K)"
-    if loc.ndim < 2 or gates.ndim < 1:
-        raise ValueError(f"{shapes} lack a dimension for the primitives: {remedy}.")
-    try:
-        torch.broadcast_shapes(loc.shape, scale.shape, (*gates.shape, 1))
-    except RuntimeError as error:
-        raise ValueError(f"{shapes} do not broadcast: {remedy}.") from error
-    for name, value, valid, rule in (
-        ("loc", loc, loc.isfinite(), "finite; look for a diverged network or an unnormalised observation"),
-        ("scale", scale, scale.isfinite() & (scale > 0), "positive and finite; pass it through an exp or a softplus"),
-        ("gates", gates, gates.isfinite() & (gates >= 0), "non-negative and finite; end the gate in a sigmoid"),
-    ):
-        if not torch._is_all_true(valid):  # as in torch.distributions: all() fails under vmap
-            raise ValueError(f"{name} of shape {tuple(value.shape)} holds {value[~valid][0].item()}, must be {rule}.")
