@@ -47,7 +47,7 @@ RESULTS = Path(__file__).resolve().parent / "results" / "off_policy.csv"
 K = 8
 """Number of the built-in primitives."""
 EVALUATION_SEED = 12345
-GAMMA, LR, UPDATES = 0.97, 1e-3, 2
+GAMMA, LR, UPDATES = 0.97, 5e-4, 3
 """SAC's discount, step size, and updates after each step of all environments."""
 PPO = (
     "method=mcp task=heading character=biped stage=transfer pretrained=builtin exploration=weights practice=beginnings "
@@ -150,7 +150,7 @@ class Size:
     sac: int = 49_152
     ppo: int = 163_840
     random: int = 2048
-    interval: int = 4096
+    interval: int = 8192
     num_envs: int = 32
     episodes: int = 64
     environment: dict[str, Any] = field(default_factory=dict)
