@@ -3,16 +3,18 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 TREE := build/tree
+LATEST := build/latest
 # One torch thread per worker: two workers with a thread pool each would fight over two cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-slow check docs linkcheck format bench tree clean
+.PHONY: help demo install test test-slow test-latest check docs linkcheck format bench tree clean
 
 help:
 	@echo "make demo       install, then run the demonstration"
 	@echo "make install    create .venv and install the pinned versions"
 	@echo "make test       every test but the learning tests"
+	@echo "make test-latest  the same with the newest packages that pyproject.toml admits"
 	@echo "make test-slow  the learning tests"
 	@echo "make check      format, lint, types, doctests"
 	@echo "make docs       the documentation, in docs/_build/html"
@@ -40,6 +42,14 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 -m slow
+
+# An environment of its own, without the pins.
+test-latest:
+	$(PYTHON) -m venv --clear $(LATEST)
+	$(LATEST)/bin/python -m pip install --quiet torch setuptools wheel
+	$(LATEST)/bin/python -m pip install --quiet --no-build-isolation -e '.[dev,warp]'
+	$(LATEST)/bin/python -m pip freeze --exclude-editable
+	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 -m "not slow"
 
 # mypy and doctest read folders, not import hooks, and so cannot see that envs/ is torchrl_mcp.envs.
 # They get a tree of links in which it is. Doctests leave out what imports an extra that need not be there.

@@ -12,7 +12,10 @@ import torch
 from hydra import compose, initialize_config_module
 from torch.nn.functional import normalize
 
+from torchrl_mcp.distributions import MultiplicativeGaussian
+from torchrl_mcp.envs import Heading
 from torchrl_mcp.runs import experiment, policies
+from torchrl_mcp.runs.builtin import builtin
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ABOUT = {"commit", "date", "processor", "instructions", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
@@ -230,3 +233,29 @@ def test_every_checkpoint_of_every_practice_is_evaluated_as_its_run_says(tmp_pat
     assert float(rows[-1]["success"]) == found["metrics"]["success"]
     assert (tmp_path / "practice_dribble.png").exists()
     assert (tmp_path / "practice_dribble_success.png").exists()
+
+
+def test_a_gate_is_trained_by_soft_actor_critic_and_by_ppo(tmp_path):
+    rows = run("off_policy.py", tmp_path / "out.csv", "--seeds", "0")
+    assert [row["learner"] for row in rows] == ["SAC"] * 2 + ["PPO"] * 2
+    assert all(0 < float(row["normalised_return"]) < 1 for row in rows)
+    assert (tmp_path / "out.png").exists()
+
+
+def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    make_env = runpy.run_path(str(BENCHMARKS / "off_policy.py"))["make_env"]
+    env = make_env(3, seed=0, max_episode_steps=5, staggered=True)  # episodes end one by one
+    state, gates = env.reset(), torch.rand(3, 8)
+    agent = policies.restore(builtin("mcp", "biped"), num_envs=1, seed=0)[1]
+    for _ in range(7):
+        before = env.base_env.get_state()
+        observation = agent.parts["observation_normaliser"](env.base_env._observe(slice(None))["observation"].float())
+        torch.testing.assert_close(state["observation"], observation)
+        loc, scale = agent.parts["primitives"](observation)
+        action = MultiplicativeGaussian(loc, scale, gates).mean.detach()
+        step, state = env.step_and_maybe_reset(state.set("action", gates))
+        assert torch.equal(step["action"], gates)
+        env_alone = Heading("biped", 3, seed=0, max_episode_steps=5)
+        expected = env_alone.step(env_alone.reset(before, set_state=True).set("action", action))
+        torch.testing.assert_close(step["next", "reward"], expected["next", "reward"])
