@@ -4,7 +4,7 @@ r"""A new gate over frozen primitives by soft actor-critic, TorchRL's SACLoss, b
 
 The built-in primitives of the biped are frozen, and both learners train a gate for the heading task with the same 32
 environments. SAC's part needs nothing of this library's training: an action is the eight gates, and ``PlayGates`` plays
-the composite's mean. PPO is ``torchrl-mcp-train`` with ``exploration=weights``. Evaluations play one deterministic
+the composite's mean. PPO is ``torchrl-mcp-train``. Evaluations play one deterministic
 episode of the printed task in each of 64 environments. Seconds are of the processor, without evaluations.
 ``--quick`` takes seconds and learns nothing.
 """
@@ -50,8 +50,8 @@ EVALUATION_SEED = 12345
 GAMMA, LR, UPDATES = 0.97, 5e-4, 3
 """SAC's discount, step size, and updates after each step of all environments."""
 PPO = (
-    "method=mcp task=heading character=biped stage=transfer pretrained=builtin exploration=weights practice=beginnings "
-    "optimizer.critic.lr=3e-4 training.frames_per_batch=1024 training.minibatch_size=256 evaluation.episodes=0 "
+    "method=mcp task=heading character=biped stage=transfer pretrained=builtin curriculum=mixed "
+    "step_size.critic=3e-4 training.frames_per_batch=1024 training.minibatch_size=256 evaluation.episodes=0 "
     "num_threads=1 torch_threads=1 keep_checkpoints=100 checkpoint_interval=16 progress_bar=false logger=none"
 )
 
@@ -162,8 +162,8 @@ QUICK = Size(sac=96, ppo=1024, random=32, interval=64, episodes=2, environment={
 def sac_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
     """Train by SAC, and yield a row for every evaluation."""
     torch.manual_seed(seed)
-    practice = {"initial_states": {"rest": 0.5, "motions": 0.5}, "staggered": True}  # as practice=beginnings
-    env = make_env(size.num_envs, seed, **practice)
+    curriculum = {"initial_states": {"rest": 1.0, "motions": 0.5}, "random_first_length": True}  # as PPO's
+    env = make_env(size.num_envs, seed, curriculum=curriculum)
     actor, evaluated, began = make_actor(), 0, time.process_time()
     for steps in train(env, actor, total_frames=size.sac, random_frames=size.random):
         if steps - evaluated >= size.interval or steps == size.sac:

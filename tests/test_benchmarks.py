@@ -245,7 +245,7 @@ def test_a_gate_is_trained_by_soft_actor_critic_and_by_ppo(tmp_path):
 def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     make_env = runpy.run_path(str(BENCHMARKS / "off_policy.py"))["make_env"]
-    env = make_env(3, seed=0, max_episode_steps=5, staggered=True)  # episodes end one by one
+    env = make_env(3, seed=0, max_episode_steps=5, curriculum={"random_first_length": True})  # episodes end one by one
     state, gates = env.reset(), torch.rand(3, 8)
     agent = policies.restore(builtin("mcp", "biped"), num_envs=1, seed=0)[1]
     for _ in range(7):
