@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.runs import build
 
 ROOT = Path(__file__).parents[1]
@@ -182,6 +183,19 @@ def test_the_documentation_has_at_most_15_000_words():
     cards = (ROOT / "torchrl_mcp" / "networks").glob("*.md")
     pages = [page for page in DOCS.rglob("*.md") if "_build" not in page.parts and page != DOCS / "commands.md"]
     assert sum(len(page.read_text().split()) for page in (*own, *cards, *pages)) <= 15_000
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+def test_every_return_of_the_results_is_in_a_table_of_the_archives_or_in_the_paper(page):
+    results = ROOT / "benchmarks" / "results"
+    tables = "".join(table.read_text() for table in (results / "table2").glob("*.md"))
+    tables += (results / "ablations" / "table.md").read_text()
+    with (results / "ideal.csv").open(newline="") as file:
+        known = {f"{float(row[name]):.3f}" for row in csv.DictReader(file) for name in ("standing", "ideal")}
+    known |= set(re.findall(r"\b\d\.\d{3}\b", tables)) | {f"{reported.mean:.3f}" for reported in TABLE_2.values()}
+    shown = set(re.findall(r"\b\d\.\d{3}\b", (ROOT / page).read_text()))
+    assert len(shown) > 10
+    assert shown <= known
 
 
 def test_what_a_return_can_reach_is_what_was_measured():
