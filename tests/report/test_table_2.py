@@ -25,7 +25,7 @@ def drawn(folder):
 
 def bars(panel):
     """Lengths of the bars of a panel by method: ours is above the name, the paper's below it."""
-    names = [label.get_text() for label in panel.get_yticklabels()]
+    names = [label.get_text() for label in panel.figure.axes[0].get_yticklabels()]
     found = defaultdict(dict)
     for bar in panel.patches:
         middle = bar.get_y() + bar.get_height() / 2
@@ -64,7 +64,7 @@ def test_the_papers_bars_stand_beside_ours_also_where_nothing_was_run(write_run,
     assert found["Scratch"] == pytest.approx({"ours": 0.4, "paper": 0.927})
     assert found["MCP"] == pytest.approx({"paper": 0.976})
     (dots,) = panel.lines
-    assert dots.get_xdata() == [0.2, 0.6]
+    assert list(dots.get_xdata()) == [0.2, 0.6]
 
 
 def test_the_share_of_successes_stands_beside_our_bar(write_run, tmp_path):

@@ -90,10 +90,12 @@ def states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
     return {state: states.count(state) for state in STATES}
 
 
-def _picture(found: Sequence[Cell]) -> str:
-    """Table 2 as bars, empty if none of its rows has been run."""
-    figure = draw_table_2(found)
-    return inline_svg(figure, "table-2", describe(found), PAGE_COLOURS) if figure else ""
+def _picture(found: Sequence[Cell]) -> dict[str, Any]:
+    """Table 2 as bars, and a width in ``rem`` for its words; empty if no row has been run."""
+    if not (figure := draw_table_2(found)):
+        return {}
+    svg = inline_svg(figure, "table-2", describe(found), PAGE_COLOURS)
+    return {"svg": svg, "width": round(6.4 * figure.get_figwidth())}
 
 
 def _overview(rows: Sequence[Row]) -> dict[str, Any]:
