@@ -80,7 +80,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 bench: $(STAMP)
-	for name in throughput training_throughput primitive_reuse; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in throughput training_throughput; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf build dist docs/_build .hypothesis .mypy_cache .pytest_cache .ruff_cache

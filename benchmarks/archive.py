@@ -150,8 +150,13 @@ def score(cell: Cell | None) -> str:
     """Return a cell in a table: the mean deterministic return, the share of successes, and the number of seeds."""
     if cell is None:
         return EMPTY
-    success = f", {cell.metrics['success']:.0%}" if "success" in cell.metrics else ""
+    success = f", {share(cell)}" if share(cell) else EMPTY
     return f"{average(cell.returns()):.3f}{success} ({len(cell.complete)})"
+
+
+def share(cell: Cell) -> str:
+    """Return the share of successful episodes of a task that has successes."""
+    return f"{cell.metrics['success']:.0%}" if "success" in cell.metrics else EMPTY
 
 
 def average(values: Sequence[float]) -> float:

@@ -27,21 +27,6 @@ def about() -> dict[str, Any]:
     return {"commit": commit(here) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
 
 
-def earned(policy: Any, env: Any) -> dict[str, Any]:
-    """Return what a policy earns in the first episode of each simulation of a task with a success and a reach."""
-    from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
-
-    numbers = episode_statistics(evaluate(policy, env), env.normalised_return)
-    return {
-        "normalised_return": round(numbers["normalised_return"], 4),
-        "interval": " ".join(f"{end:.4f}" for end in numbers["interval"]),
-        "place": round(numbers["reach"]["place"], 4),
-        "success": round(numbers["metrics"]["success"], 4),
-        "fallen": round(numbers["terminated"], 4),
-        "episodes": env.num_envs,
-    }
-
-
 def table(rows: list[dict[str, Any]]) -> str:
     """Return rows with the same keys as text, a line each."""
     from torchrl_mcp.runs.tables import text_table

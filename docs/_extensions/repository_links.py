@@ -9,9 +9,8 @@ from sphinx.application import Sphinx
 
 PAGES = {
     "../README.md": "/index.md",
-    "../benchmarks/README.md": "/performance.md",
+    "../benchmarks/README.md": "/benchmarks.md",
     "../CONTRIBUTING.md": "/contributing.md",
-    "../docs/performance.md": "/performance.md",
     "../CHANGELOG.md": "/changelog.md",
 }
 """Where each of them is shown, relative to this folder."""
@@ -30,6 +29,7 @@ def correct(app: Sphinx, path: Path, page: str, content: list[str]) -> None:
 
     def replacement(match: re.Match[str]) -> str:
         target = normpath(path.parent / match[1])
-        return PAGES.get(target, f"/{relpath(target, '.')}") + (match[2] or "")
+        shown = target.removeprefix("../docs/") if target.startswith("../docs/") else relpath(target, ".")
+        return PAGES.get(target, f"/{shown}") + (match[2] or "")
 
     content[0] = LINK.sub(replacement, content[0])

@@ -223,7 +223,7 @@ def contact_room(model: mujoco.MjModel) -> int:
     """Return the number of contacts to allocate for each simulation.
 
     This is half of the contacts that all geoms could have with the ground, and eight more. In falls of the library's
-    characters, no simulation of any scene had more than 0.6 times this number (``benchmarks/contact_room.py``).
+    characters, no simulation of any scene had more than 0.6 times this number.
     """
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     kinds = model.geom_type[touching & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)]

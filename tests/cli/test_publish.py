@@ -131,7 +131,7 @@ def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatc
 def test_the_card_of_a_network_for_imitation_has_the_published_numbers(character):
     network = PRETRAINED.with_name(f"mcp-{character}.torchrl")
     card, root = network.with_suffix(".md").read_text(), PRETRAINED.parents[2]
-    assert f"networks/mcp-{character}.md" in (root / "docs" / "networks.md").read_text()
+    assert f"networks/mcp-{character}.md" in (root / "docs" / "gallery.md").read_text()
     assert f"{network.stat().st_size / 1e6:.1f} MB" in card
     with (root / "benchmarks" / "results" / "imitation.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["character"] == character]
@@ -145,7 +145,7 @@ def test_the_card_of_a_network_for_imitation_has_the_published_numbers(character
     "gate", sorted(filter(builtin.has_task, PRETRAINED.parent.glob("*.torchrl"))), ids=lambda p: p.stem
 )
 def test_every_gate_that_comes_with_the_library_has_a_card_and_does_its_task(gate):
-    page = (gate.parents[2] / "docs" / "networks.md").read_text()
+    page = (gate.parents[2] / "docs" / "gallery.md").read_text()
     assert gate.with_suffix(".md").is_file()
     assert f"networks/{gate.stem}.md" in page
     if "heading" in gate.stem:

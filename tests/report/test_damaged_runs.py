@@ -64,11 +64,12 @@ def test_what_the_environment_holds_does_not_get_into_a_report(write_run, tmp_pa
     assert "swordfish" not in "".join(pages.values())
 
 
-def test_the_command_writes_both_files(varied_runs, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_both_pages_and_the_picture(varied_runs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(varied_runs), "--output", str(tmp_path / "a" / "b")])
     main()
     assert capsys.readouterr().out.startswith("16 runs, 12 complete, 1 not evaluated, 1 unfinished, 2 damaged: ")
-    assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == ["report.html", "report.md"]
+    found = sorted(path.name for path in (tmp_path / "a" / "b").iterdir())
+    assert found == ["report.html", "report.md", "table_2.png", "table_2.svg"]
 
 
 def test_the_command_tells_what_is_wrong_with_its_arguments(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
 from torchrl_mcp.runs import experiment, policies
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
-from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.runs.identity import CONDUCT, is_among
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.run_folder import PROVENANCE, read_json
 
@@ -62,51 +62,41 @@ def model_card(
     """
     name = path.stem.removeprefix("mcp-")
     checkpoint_name = f"{PREFIX}{name}" if path.parent.resolve() == FOLDER.resolve() else path.name
-    modes = ("deterministic", "stochastic")
-    returns = text_table([{"actions": mode, **_row(numbers[mode])} for mode in modes], markdown=True)
+    returns = "\n".join(f"- {mode}: {_returns(numbers[mode])}" for mode in ("deterministic", "stochastic"))
     character = CHARACTERS.get(cfg.character.name, cfg.character.name)
     return f"""\
 # {name}
 
-{cfg.method.title} on `task={cfg.task.name}` with the {character if character == "T-Rex" else character.lower()}.
-
-```bash
-torchrl-mcp-play {checkpoint_name} --viewer web
-```
+{cfg.method.title} on `task={cfg.task.name}` with the {character if character == "T-Rex" else character.lower()}:
+`torchrl-mcp-play {checkpoint_name} --viewer web`.
 
 {_facts(path, cfg, origin, steps)}
 
-## Returns
-
-Normalised return of this file in the task of the paper: {numbers["episodes"]} episodes, seed {numbers["seed"]},
-with 95 % intervals.
+Normalised return, {numbers["episodes"]} episodes of seed {numbers["seed"]} (the paper: {_paper(cfg)}):
 
 {returns}
 
-{_paper(cfg)}
-
-## Limits
+Limits:
 
 {chr(10).join(f"- {limit}" for limit in limits) or "- Not stated."}
 """
 
 
 def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -> str:
-    """Return the table of how a policy was trained."""
-    rows = {
-        "contents": _contents(path, cfg),
-        "training": f"{steps:,} steps, preset {origin.get('choices', {}).get('preset', 'unknown')}, seed {cfg.seed}",
-        "command": f"`{command(origin.get('command', []))}`",
-        "commit": origin.get("commit") or "unknown",
-        "machine": origin.get("machine", {}).get("processor", "unknown"),
-        "size": f"{path.stat().st_size / 1e6:.1f} MB, parameters in bfloat16",
-    }
-    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+    """Return how a policy was trained, as a list."""
+    preset, machine = origin.get("choices", {}).get("preset", "unknown"), origin.get("machine", {})
+    facts = (
+        f"{_contents(path, cfg)}; {path.stat().st_size / 1e6:.1f} MB in bfloat16",
+        f"{steps:,} steps, preset {preset}, seed {cfg.seed}, {machine.get('processor', 'unknown machine')}",
+        f"`{command(origin.get('command', []))}`, commit {origin.get('commit') or 'unknown'}",
+    )
+    return "\n".join(f"- {fact}" for fact in facts)
 
 
 def command(words: Sequence[str]) -> str:
-    """Return the command that started a run, without folders of the machine."""
-    return shlex.join(word for word in words if not word.startswith(PLACES))
+    """Return the command that started a run, without folders of the machine and settings that make no other run."""
+    kept = (word for word in words if not word.startswith(PLACES))
+    return shlex.join(word for word in kept if not is_among(word.partition("=")[0], CONDUCT))
 
 
 def _contents(path: Path, cfg: DictConfig) -> str:
@@ -114,27 +104,19 @@ def _contents(path: Path, cfg: DictConfig) -> str:
     if not (shared := checkpoint.shared(path)):
         return "the whole policy"
     origin = builtin(cfg.method.name, cfg.character.name)
-    names = " and ".join(f"`{name}`" for name in shared)
-    return f"the gate and the normaliser of its goal; the frozen parts {names} are in `{origin.name}`"
+    return f"the parts that were trained; {' and '.join(shared)} are in `{origin.name}`"
 
 
-def _row(numbers: Mapping[str, Any]) -> dict[str, str]:
-    """Cells of the table of returns."""
-    cells = {
-        "normalised return": "{:.3f} ({:.3f} to {:.3f})".format(numbers["normalised_return"], *numbers["interval"]),
-        "fallen": f"{numbers['terminated']:.0%}",
-    }
-    if reach := numbers.get("reach"):
-        cells["standing still"], cells["ideal"] = f"{reach['standing']:.3f}", f"{reach['ideal']:.3f}"
-    return cells | {name.replace("_", " "): f"{value:.3f}" for name, value in numbers["metrics"].items()}
+def _returns(numbers: Mapping[str, Any]) -> str:
+    """Return the results of one mode in a line, with the interval of the return."""
+    metrics = "".join(f", {name.replace('_', ' ')} {value:.3f}" for name, value in numbers["metrics"].items())
+    value, (low, high) = numbers["normalised_return"], numbers["interval"]
+    return f"{value:.3f} ({low:.3f} to {high:.3f}), fallen {numbers['terminated']:.0%}{metrics}"
 
 
 def _paper(cfg: DictConfig) -> str:
-    """Return a sentence about Table 2, if it has the cell."""
+    """Return the paper's number in Table 2, if it has one."""
     reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
     if cfg.stage.name != "transfer" or reported is None:
-        return "The paper has no return to compare with."
-    return (
-        f"The paper's {cfg.method.title} reaches {reported.mean:.3f} ± {reported.std:.3f}; its training budget is not "
-        "stated."
-    )
+        return "no return"
+    return f"{reported.mean:.3f} ± {reported.std:.3f}"

@@ -18,8 +18,11 @@ def main() -> None:
     if missing := [str(path) for path in arguments.runs if not path.is_dir()]:
         sys.exit(f"{PROGRAM}: there is no folder {' and no folder '.join(missing)}")
     announce(PROGRAM)
+    from torchrl_mcp.analysis.figures import save_figure
+    from torchrl_mcp.report.comparison import cells
     from torchrl_mcp.report.page import report, states
     from torchrl_mcp.report.results import find_runs
+    from torchrl_mcp.report.table_2 import draw_table_2
     from torchrl_mcp.training.run_folder import replacing
 
     try:
@@ -30,6 +33,8 @@ def main() -> None:
     for name, text in pages.items():
         with replacing(arguments.output / name) as partial:
             partial.write_text(text, encoding="utf-8")
+    if picture := draw_table_2(cells(runs)):
+        save_figure(picture, arguments.output / "table_2")
     counts = ", ".join(f"{number} {state}" for state, number in states(runs, damaged).items() if number)
     number = len(runs) + len(damaged)
     places = shlex.join(str(arguments.output / name) for name in pages)

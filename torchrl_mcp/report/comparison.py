@@ -50,6 +50,11 @@ class Cell:
         return self.runs[0].title
 
     @property
+    def steps(self) -> int:
+        """Environment steps of a whole run."""
+        return self.runs[0].total_frames
+
+    @property
     def is_standard(self) -> bool:
         """Whether the settings are the method's standard ones, so that the cell is no variant."""
         standard = self.runs[0].standard

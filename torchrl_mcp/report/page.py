@@ -9,10 +9,11 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_mcp import __version__
-from torchrl_mcp.report.comparison import cells, methods, over_tasks
+from torchrl_mcp.report.comparison import Cell, cells, methods, over_tasks
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.report.results import MODES, STATES, Damaged, Run
 from torchrl_mcp.report.sections import (
+    PAGE_COLOURS,
     Row,
     Section,
     ablation_chapters,
@@ -22,6 +23,8 @@ from torchrl_mcp.report.sections import (
     row,
     task_sections,
 )
+from torchrl_mcp.report.svg import inline_svg
+from torchrl_mcp.report.table_2 import describe, draw_table_2
 from torchrl_mcp.training import precision
 
 PAGES = ("report.html", "report.md")
@@ -63,6 +66,7 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
         "states": states(runs, damaged),
         "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
         "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_standard]),
+        "picture": _picture(found),
         "titles": methods(found),
         "shared": shared,
         "aggregate": aggregate,
@@ -84,6 +88,14 @@ def states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
     """Number of runs by state."""
     states = [run.state for run in runs] + ["damaged"] * len(damaged)
     return {state: states.count(state) for state in STATES}
+
+
+def _picture(found: Sequence[Cell]) -> dict[str, Any]:
+    """Table 2 as bars, and a width in ``rem`` for its words; empty if no row has been run."""
+    if not (figure := draw_table_2(found)):
+        return {}
+    svg = inline_svg(figure, "table-2", describe(found), PAGE_COLOURS)
+    return {"svg": svg, "width": round(6.4 * figure.get_figwidth())}
 
 
 def _overview(rows: Sequence[Row]) -> dict[str, Any]:

@@ -15,8 +15,19 @@ class Reported(NamedTuple):
     std: float
 
 
-METHODS = ("scratch", "finetune", "hierarchical", "option_critic", "moe", "latent_space", "mcp")
+TITLES = {
+    "scratch": "Scratch",
+    "finetune": "Finetune",
+    "hierarchical": "Hierarchical",
+    "option_critic": "Option critic",
+    "moe": "MOE",
+    "latent_space": "Latent space",
+    "mcp": "MCP",
+}
 """Columns of Table 2."""
+
+METHODS = tuple(TITLES)
+"""Names of the methods in Table 2."""
 
 CHARACTERS = {"biped": "Biped", "humanoid": "Humanoid", "trex": "T-Rex", "ant": "Ant"}
 

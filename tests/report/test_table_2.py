@@ -1,0 +1,90 @@
+"""The picture of Table 2: what its bars are as long as."""
+
+import csv
+import tarfile
+from collections import defaultdict
+from pathlib import Path
+from statistics import mean
+
+import pytest
+
+from torchrl_mcp.report.comparison import cells
+from torchrl_mcp.report.results import find_runs
+from torchrl_mcp.report.table_2 import describe, draw_table_2
+
+PUBLISHED = Path(__file__).parents[2] / "benchmarks/results/table2"
+ROWS = [
+    *("heading, Biped", "heading, Humanoid", "heading, T-Rex", "carry, Biped"),
+    *("dribble, Biped", "dribble, Humanoid", "dribble, T-Rex", "holdout, Ant"),
+]
+
+
+def drawn(folder):
+    return draw_table_2(cells(find_runs([folder])[0]))
+
+
+def bars(panel):
+    """Lengths of the bars of a panel by method: ours is above the name, the paper's below it."""
+    names = [label.get_text() for label in panel.figure.axes[0].get_yticklabels()]
+    found = defaultdict(dict)
+    for bar in panel.patches:
+        middle = bar.get_y() + bar.get_height() / 2
+        method = round(middle)
+        found[names[method]]["ours" if middle < method else "paper"] = bar.get_width()
+    return dict(found)
+
+
+def test_bars_are_as_long_as_the_published_runs_returns(tmp_path):
+    with tarfile.open(PUBLISHED / "runs.tar.xz") as packed:
+        packed.extractall(tmp_path, filter="data")
+    figure = drawn(tmp_path)
+    assert [panel.get_title() for panel in figure.axes] == ROWS
+    with (PUBLISHED / "runs.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["stage"] == "transfer" and row["mode"] == "deterministic"]
+    for panel in figure.axes:
+        place = panel.get_title().lower().replace("t-rex", "trex").split(", ")
+        returns = defaultdict(lambda: defaultdict(list))
+        for row in rows:
+            if [row["task"], row["character"]] == place:
+                method = row["method"].split(",")[0].replace("-", " ").lower()
+                returns[method][int(row["steps"]), row["method"]].append(float(row["normalised_return"]))
+        shown = {name.lower(): both["ours"] for name, both in bars(panel).items() if "ours" in both}
+        assert shown.keys() == returns.keys()
+        for method, by_length in returns.items():
+            steps = (max if method == "scratch" else min)(length for length, _ in by_length)
+            best = max(mean(seeds) for (length, _), seeds in by_length.items() if length == steps)
+            assert shown[method] == pytest.approx(best, abs=1e-6)
+
+
+def test_the_papers_bars_stand_beside_ours_also_where_nothing_was_run(write_run, tmp_path):
+    for seed, score in enumerate((0.2, 0.6)):
+        write_run(f"scratch{seed}", seed=seed, score=score)
+    (panel,) = drawn(tmp_path).axes
+    found = bars(panel)
+    assert found["Scratch"] == pytest.approx({"ours": 0.4, "paper": 0.927})
+    assert found["MCP"] == pytest.approx({"paper": 0.976})
+    (dots,) = panel.lines
+    assert list(dots.get_xdata()) == [0.2, 0.6]
+
+
+def test_the_share_of_successes_stands_beside_our_bar(write_run, tmp_path):
+    path = write_run("carrier", task="carry", score=0.3) / "evaluation.json"
+    path.write_text(path.read_text().replace('"metrics": {}', '"metrics": {"success": 0.125}'))
+    (panel,) = drawn(tmp_path).axes
+    (text,) = panel.texts
+    assert text.get_text() == "12%"
+    assert text.get_position()[0] > 0.3
+
+
+def test_a_method_of_your_own_stands_below_the_papers(write_run, tmp_path):
+    write_run("own", method="mine", method__title="Mine", score=0.5)
+    (panel,) = drawn(tmp_path).axes
+    assert panel.get_yticklabels()[-1].get_text() == "Mine"
+    assert bars(panel)["Mine"] == pytest.approx({"ours": 0.5})
+    assert "heading with the Biped: Mine 0.500" in describe(cells(find_runs([tmp_path])[0]))
+
+
+def test_without_a_row_of_table_2_there_is_no_picture(write_run, tmp_path):
+    write_run("pretraining", task="imitation", stage="pretrain", score=0.5)
+    write_run("unfinished", progress=0.5)
+    assert drawn(tmp_path) is None

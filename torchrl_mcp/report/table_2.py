@@ -1,0 +1,108 @@
+"""Table 2 as a picture: a panel for each row, with our returns beside the paper's."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
+from torchrl_mcp.report.comparison import Cell, methods
+from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
+
+BAR = 0.38
+"""Width of a bar; a method has two, one unit apart from the next method's."""
+
+COLUMNS = 4
+"""Panels beside one another."""
+
+Place = tuple[str, str]
+
+
+def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
+    """Return the cell that stands for each method in a row of Table 2.
+
+    Scratch stands with its longest runs, which may have the steps of both stages. The others stand with as many steps
+    as the shortest of their runs. Of several cells of a method, such as two kinds of exploration, the one with the
+    highest deterministic return stands for it.
+
+    Args:
+        cells: Cells of any task and stage.
+        place: Task and character.
+    """
+    here = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
+    longest = max((cell.steps for cell in here if cell.method == "scratch"), default=0)
+    shortest = min((cell.steps for cell in here if cell.method != "scratch"), default=0)
+    best: dict[str, Cell] = {}
+    for cell in here:
+        if cell.steps == (longest if cell.method == "scratch" else shortest):
+            best[cell.method] = max(best.get(cell.method, cell), cell, key=average)
+    return best
+
+
+def average(cell: Cell) -> float:
+    """Return the mean deterministic return over seeds."""
+    return sum(cell.returns()) / len(cell.complete)
+
+
+def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
+    """Draw our returns and the paper's as bars, a panel for each row of Table 2 that has been run.
+
+    Dots are single seeds. Where a task has successes, their share stands beside our bar.
+
+    Args:
+        cells: Cells of any task and stage.
+
+    Returns:
+        The figure, or None if no row has been run.
+    """
+    rows = {place: found for place in PLACES if (found := compared(cells, place))}
+    if not rows:
+        return None
+    run = methods(cell for found in rows.values() for cell in found.values())
+    named = TITLES | {name: title for name, title in run.items() if name not in TITLES}
+    lines, columns = -(-len(rows) // COLUMNS), min(len(rows), COLUMNS)
+    figure = new_figure(1.2 + 2.2 * columns, 0.5 + (0.5 + 0.27 * len(named)) * lines)
+    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat
+    for place, axes in zip(rows, panels, strict=False):
+        draw_row(axes, place, rows[place], named)
+    for axes in list(panels)[len(rows) :]:
+        axes.remove()
+    keys = [Patch(color=COLOURS[0], label="ours"), Patch(color=FAINT, label="paper")]
+    figure.legend(handles=keys, loc="outside upper center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping[str, str]) -> None:
+    """Draw a panel: two bars for each method, the first of them on top."""
+    task, character = place
+    for position, method in enumerate(named):
+        if method in found:
+            cell = found[method]
+            axes.barh(position - BAR / 2, average(cell), BAR, color=COLOURS[0])
+            axes.plot(cell.returns(), [position - BAR / 2] * len(cell.complete), ".", color=INK, markersize=3)
+            if "success" in cell.metrics:
+                end = max(*cell.returns(), 0.0) + 0.03
+                share = f"{cell.metrics['success']:.0%}"
+                axes.text(end, position - BAR / 2, share, va="center", fontsize=7, color=INK)
+        if (*place, method) in TABLE_2:
+            axes.barh(position + BAR / 2, TABLE_2[*place, method].mean, BAR, color=FAINT)
+    axes.set_title(f"{task}, {CHARACTERS.get(character, character)}", fontsize=9, color=INK)
+    axes.set_yticks(range(len(named)), named.values())
+    axes.set_ylim(len(named) - 0.5, -0.5)
+    axes.set_xticks([0.0, 0.5, 1.0])
+    axes.grid(axis="x", color="#EEEEEE")
+    axes.set_axisbelow(True)
+    bare(axes)
+
+
+def describe(cells: Sequence[Cell]) -> str:
+    """Return what the picture shows, for readers who do not see it."""
+    parts = []
+    for place in PLACES:
+        returns = [
+            f"{TITLES.get(name, cell.title)} {average(cell):.3f}" for name, cell in compared(cells, place).items()
+        ]
+        if returns:
+            parts.append(f"{place[0]} with the {CHARACTERS[place[1]]}: {', '.join(returns)}")
+    return f"Normalised returns beside the paper's. {'; '.join(parts)}"
