@@ -119,7 +119,7 @@ def test_the_full_budgets_are_the_ones_that_it_tells(tmp_path, pretrain):
 
 def test_the_primitives_had_as_many_steps_of_imitation_as_it_says():
     card = builtin("mcp", "humanoid").with_suffix(".md").read_text()
-    assert re.search(r"\| training \| ([\d,]+) steps", card)[1] == f"{demo.BUILTIN_STEPS:,}"
+    assert f"{demo.BUILTIN_STEPS:,} steps" in card
 
 
 def test_the_return_is_shown_once_full_episodes_can_have_ended(tmp_path):
