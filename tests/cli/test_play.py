@@ -4,7 +4,8 @@ import pytest
 from PIL import Image
 
 from torchrl_mcp.cli import play, playing
-from torchrl_mcp.envs import Heading, opengl
+from torchrl_mcp.envs import Heading
+from torchrl_mcp.envs.rendering import opengl
 
 
 def call(monkeypatch, *arguments):

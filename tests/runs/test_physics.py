@@ -7,7 +7,8 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp.envs import Heading, engines
+from torchrl_mcp.envs import Heading
+from torchrl_mcp.envs.physics import engines
 from torchrl_mcp.evaluation.rollout import evaluate
 from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.runs.builtin import builtin
