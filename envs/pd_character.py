@@ -184,7 +184,10 @@ class PDCharacterEnv(CharacterEnv):
         return seen[:, :own], seen[:, own:].unflatten(-1, (-1, 13))
 
     def training_reward(self) -> Tensor:
-        """Reward of the last step with the curriculum's ``reward_weights``, ``(N,)``, float64."""
+        """Reward of the last step with the curriculum's ``reward_weights``, ``(N,)``, float64.
+
+        Tasks define it whose reward has terms to weigh, ``num_reward_terms``.
+        """
         raise NotImplementedError
 
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
-from torchrl_mcp.envs.tasks.rewards import carry_reward, reward_until_success
+from torchrl_mcp.envs.tasks.rewards import reward_until_success, transport_reward
 from torchrl_mcp.envs.tasks.tables import DROP, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
@@ -40,6 +40,11 @@ RESTING_GAP = 0.01
 
 RELEASE_GAP = DROP + RESTING_GAP
 """Largest distance in metres between box and top at which the joint opens, reached at the box's initial height."""
+
+
+carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)
+"""The reward with the weights of its four terms: the character's speed towards the box and its distance from the box,
+and the speed of the box towards the target and its distance from the target."""
 
 
 class Carry(PDCharacterEnv):

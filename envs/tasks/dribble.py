@@ -14,7 +14,7 @@ from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
-from torchrl_mcp.envs.tasks.rewards import dribble_reward, reward_until_success
+from torchrl_mcp.envs.tasks.rewards import reward_until_success, transport_reward
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     SUCCESS_DISTANCE,
@@ -53,6 +53,11 @@ FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 
 
 SUCCESS_REACH = 2.0
 """Largest distance in metres between character and ball for success."""
+
+
+dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)
+"""The reward with the weights of its four terms: the character's speed towards the ball and its distance from the ball,
+and the speed of the ball towards the target and its distance from the target."""
 
 
 class Dribble(PDCharacterEnv):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -171,10 +171,3 @@ def reward_until_success(
     """
     idle = idle_reward(weights, speed)
     return (reward - idle).masked_fill(success, (sum(weights) - idle) / (1 - discount))
-
-
-carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)
-""":func:`transport_reward` with the constants of the carry task."""
-
-dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)
-""":func:`transport_reward` with the constants of the dribble task."""

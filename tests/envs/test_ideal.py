@@ -5,7 +5,7 @@ import torch
 
 from torchrl_mcp.envs import Carry, Dribble, Heading
 from torchrl_mcp.envs.ideal import transport_reach
-from torchrl_mcp.envs.tasks.rewards import dribble_reward
+from torchrl_mcp.envs.tasks.dribble import dribble_reward
 
 LAWS = {"speed": 1.0, "target_distance_power": 2}
 

@@ -51,6 +51,13 @@ def test_a_box_that_stands_on_the_target_when_the_joint_opens_ends_the_episode_w
     np.testing.assert_allclose(outcome["reward"], 10 * full, rtol=1e-6)
 
 
+def test_the_reward_is_1_from_the_step_on_in_which_the_joint_opens_if_a_success_is_rewarded(over_the_target):
+    env = make(success_reward=True)
+    outcome = play(env, env.reset(over_the_target(env, 0.005), set_state=True), 1)
+    assert outcome["success"].all()
+    assert (outcome["reward"] == 1).all()
+
+
 @pytest.mark.parametrize("clearance", [0.005, 0.05])
 def test_the_joint_opens_over_the_target_and_the_box_then_stands_there(clearance, over_the_target):
     env = make()

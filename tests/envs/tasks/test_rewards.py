@@ -1,7 +1,9 @@
 import pytest
 import torch
 
-from torchrl_mcp.envs.tasks.rewards import carry_reward, dribble_reward, holdout_reward
+from torchrl_mcp.envs.tasks.carry import carry_reward
+from torchrl_mcp.envs.tasks.dribble import dribble_reward
+from torchrl_mcp.envs.tasks.rewards import holdout_reward
 
 PAPER = {"forward_weight": 1.0, "healthy_weight": 1.0, "control_weight": 0.5, "contact_weight": 0.0005}
 
