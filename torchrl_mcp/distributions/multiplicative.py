@@ -50,6 +50,7 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
         NeurIPS 2019, https://arxiv.org/abs/1905.09808, Eq. 3.
 
     Example:
+        >>> import torch
         >>> loc, scale = torch.tensor([[0.0], [3.0]]), torch.tensor([[1.0], [2.0]])
         >>> policy = MultiplicativeGaussian(loc, scale, gates=torch.tensor([0.5, 2.0]))
         >>> policy.mean, policy.variance
