@@ -36,7 +36,13 @@ def test_a_run_goes_on_with_another_conduct_but_with_no_other_setting():
     assert differences(held, held) == []
     for name in held:
         found = differences(held, {**held, name: 1})
-        assert found == ([] if name in CONDUCT | PLACES else [name])
+        assert found == ([] if name in CONDUCT | {"run_dir", "run_root"} else [name])
+
+
+def test_networks_elsewhere_make_no_other_run_but_those_of_the_library_do():
+    runs = [{"pretrained": value} for value in ("runs/a", "elsewhere/b", "builtin", None)]
+    differing = [bool(differences(runs[0], run)) for run in runs]
+    assert differing == [False, False, True, True]
 
 
 def test_a_setting_that_only_one_of_two_has_makes_them_differ():

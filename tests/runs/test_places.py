@@ -127,6 +127,13 @@ def test_folders_of_other_networks_have_other_names_wherever_those_are(root):
     assert identity.folder_name("x-1", str(moved)) != name
 
 
+def test_a_damaged_checkpoint_is_refused_as_such(root, command):
+    (root / "damaged.torchrl").write_bytes(b"no checkpoint")
+    outcome = command("train", *SHORT, "task=holdout", "stage=pretrain", "pretrained=damaged.torchrl", cwd=root)
+    assert outcome.returncode
+    assert "damaged.torchrl is damaged, or is not a checkpoint" in outcome.stderr
+
+
 def test_long_names_are_shortened_and_stay_different():
     names = {identity.folder_name("_".join(f"optimizer.x{i}-{i + end}" for i in range(30)), None) for end in (0.1, 0.2)}
     assert len(names) == 2

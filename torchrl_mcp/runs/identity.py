@@ -60,18 +60,18 @@ def is_among(name: str, settings: Collection[str]) -> bool:
 
 
 def differences(
-    held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT | PLACES
+    held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT | {"run_dir", "run_root"}
 ) -> list[str]:
     """Return the top-level settings in which two configurations differ, so that they are different runs.
 
-    Paths of files and folders are not compared.
+    Paths of files and folders count as equal.
 
     >>> differences({"seed": 0, "device": "cpu"}, {"seed": 1, "device": "cuda"})
     ['seed']
     """
     agreed = {*ignored, *(key for key, value in LEFT_OPEN.items() if wanted.get(key) == value)}
     keys = [key for key in dict.fromkeys([*held, *wanted]) if key not in agreed]
-    return [key for key in keys if placeless(held.get(key)) != placeless(wanted.get(key))]
+    return [key for key in keys if placeless({key: held.get(key)}) != placeless({key: wanted.get(key)})]
 
 
 def folder_name(overrides: str, pretrained: str | None) -> str:

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
+from zipfile import ZipFile, is_zipfile
 
 from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
@@ -105,15 +105,15 @@ def digests(config: Mapping[str, Any]) -> dict[str, str]:
 def digest(path: Path) -> str:
     """Return eight letters that identify the content of a file or folder, wherever it is.
 
-    Of a run folder they identify the networks in its newest checkpoint, and of a checkpoint file its networks.
+    Of a run folder or checkpoint they identify the networks (of its newest checkpoint), of any other folder the names
+    and sizes of its files.
     """
     file = next(iter(find_all(path)), path)
-    if file.suffix == ".torchrl" and file.is_file():
-        parts = _networks(file)
-    elif file.is_dir():
-        parts = [(str(part.relative_to(file)), _crc(part)) for part in sorted(file.rglob("*")) if part.is_file()]
+    if file.is_dir():
+        members = sorted(member for member in file.rglob("*") if member.is_file())
+        parts = [(str(member.relative_to(file)), member.stat().st_size) for member in members]
     else:
-        parts = [(file.name, _crc(file))]
+        parts = _networks(file) if is_zipfile(file) else [("", zlib.crc32(file.read_bytes()))]
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:8]
 
 
@@ -122,10 +122,6 @@ def _networks(file: Path) -> list[tuple[str, int]]:
     with ZipFile(file) as archive:
         members = [(member.filename.partition("-part-")[2], member.CRC) for member in archive.infolist()]
     return sorted(pair for pair in members if pair[0].endswith(".memmap"))
-
-
-def _crc(file: Path) -> int:
-    return zlib.crc32(file.read_bytes())
 
 
 def _mapped(value: Any, change: Callable[[str, str], str], name: str = "") -> Any:
