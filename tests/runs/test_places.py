@@ -15,7 +15,7 @@ from torchrl_mcp.runs import identity, places, quoting
 
 FAST = ["preset=smoke", "num_threads=1", "progress_bar=false", "width=0.05", "evaluation.episodes=0"]
 SHORT = [*FAST, "method=scratch", "training.total_frames=128"]
-NASTY = ["a=b", "a[1]", "größe", "two words", "it's", 'say "x"', "back\\slash\\", "a,b", "{x}", "$HOME", "1e5", "null"]
+NASTY = ["a=b[1]", "größe", "two words, it's", 'say "x"', "back\\slash\\", "{x}$HOME", "1e5"]
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,9 @@ def test_what_is_printed_runs_in_a_folder_of_any_name(root, command, name):
     assert root / shlex.split(play)[1] == folder
 
 
-@pytest.mark.parametrize("value", [*NASTY, "", "a\\\\\"b'", "~x", " x ", "a:b", "100%", "a|b&c;d", ".inf", "-1", "@x"])
+@pytest.mark.parametrize(
+    "value", [*NASTY, "", "null", "a\\\\\"b'", "~x", " x ", "a:b", "100%", "a|b&c;d", ".inf", "-1", "@x"]
+)
 def test_a_quoted_value_is_read_by_hydra_as_it_is(value):
     (override,) = OverridesParser.create().parse_overrides([quoting.setting("run_dir", value)])
     assert override.value() == value
