@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import sys
+from itertools import accumulate
 from pathlib import Path
 from types import ModuleType
 
@@ -219,8 +220,8 @@ def test_every_module_has_its_place_in_the_reference():
     for name in modules():
         if name.startswith("torchrl_mcp.cli."):
             continue  # commands have a page of their own
-        package = importlib.import_module(name.rpartition(".")[0])
-        exports = (getattr(package, export) for export in getattr(package, "__all__", ()))
+        packages = [importlib.import_module(package) for package in accumulate(name.split(".")[:-1], "{}.{}".format)]
+        exports = (getattr(package, export) for package in packages for export in getattr(package, "__all__", ()))
         exported = {getattr(export, "__module__", None) for export in exports}
         assert name in documented | exported, f"{name}: add it to a page of docs/api"
 

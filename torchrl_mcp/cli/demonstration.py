@@ -10,14 +10,13 @@ import time
 from collections.abc import Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.cli.demonstration_page import write_page
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.runs.identity import PLACES, differences
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
@@ -115,12 +114,9 @@ def _require_same(cfg: DictConfig, folder: Path) -> None:
     """
     if not (folder / CONFIG).exists():
         return
-    held = experiment.run_config(folder)
-    cfg.autocast = held.autocast
-    wanted = experiment.settled(cfg) if cfg.pretrained == "builtin" else cfg
-    began, begins = (cast("dict", OmegaConf.to_container(one, resolve=True)) for one in (held, wanted))
-    if differences(began, begins, PLACES):
-        raise ValueError(f"{folder} holds a run with other settings: give another --output, or delete it")
+    cfg.autocast = experiment.run_config(folder).autocast
+    if changed := experiment.changes(folder, build.stored(experiment.settled(cfg))):
+        raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another --output")
 
 
 def introduction(runs: Runs, folder: Path) -> str:
