@@ -13,10 +13,6 @@ import tensordict  # noqa: F401
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.tasks.carry import Carry
-from torchrl_mcp.envs.tasks.dribble import Dribble
-from torchrl_mcp.envs.tasks.heading import Heading
-from torchrl_mcp.envs.tasks.holdout import Holdout
-from torchrl_mcp.envs.tasks.imitation import Imitation
+from torchrl_mcp.envs.tasks import Carry, Dribble, Heading, Holdout, Imitation
 
 __all__ = ["Carry", "CharacterEnv", "Curriculum", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
