@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
@@ -80,6 +81,20 @@ def heading(q: Tensor) -> Tensor:
     """Horizontal angle of a body's x axis from the world's x axis, shape ``(*B)``, in (-pi, pi]."""
     w, x, y, z = q.unbind(-1)
     return torch.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+
+
+def shortest(a: Tensor, b: Tensor) -> Tensor:
+    """Shortest rotation from one direction to another, shape ``(*B, 4)``; a half turn if they are opposite.
+
+    Args:
+        a: Unit vectors, shape ``(*B, 3)``.
+        b: Unit vectors, shape ``(*B, 3)``.
+    """
+    turn = torch.cat([1 + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], dim=-1)
+    x, y = torch.eye(3, dtype=a.dtype, device=a.device)[:2]
+    across = torch.linalg.cross(a, torch.where(a[..., :1].abs() < 0.9, x, y))
+    half_turn = torch.cat([torch.zeros_like(across[..., :1]), across], dim=-1)
+    return normalize(torch.where(turn.norm(dim=-1, keepdim=True) < 1e-9, half_turn, turn), dim=-1)
 
 
 def slerp(a: Tensor, b: Tensor, fraction: Tensor) -> Tensor:

@@ -1,34 +1,21 @@
 """Motion clips: trajectories of a character's root and joints."""
 
-import lzma
 import math
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from tokenize import TokenError
 from typing import Self
-from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters.joints import JointLayout, joint_layout
+from torchrl_mcp.envs.motions.archive import UNREADABLE, load_arrays
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
-
-LARGEST = 2**28
-"""Most bytes of the arrays of a clip: hours of a T-Rex at 60 frames per second."""
-
-# Exceptions of zipfile, NumPy and torch when a file is damaged or of another kind.
-UNREADABLE = (
-    *(ArithmeticError, AttributeError, BadZipFile, EOFError, LookupError, MemoryError, OSError, RuntimeError),
-    *(SyntaxError, TokenError, TypeError, ValueError, lzma.LZMAError, struct.error, zlib.error),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +154,7 @@ class MotionClip:
             MotionFormatError: If the file is no clip, is damaged, or has other joints than the character's model.
         """
         try:
-            return cls._from_arrays(_arrays(Path(path)))
+            return cls._from_arrays(load_arrays(Path(path)))
         except UNREADABLE as error:
             raise MotionFormatError(
                 path,
@@ -194,15 +181,6 @@ class MotionClip:
     def _within(self, times: Tensor) -> Tensor:
         """State at times within the first cycle, including its end."""
         return replace(self, loop=False).at(times)
-
-
-def _arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a NumPy archive, after checking its size."""
-    with ZipFile(path) as archive:
-        if (size := sum(member.file_size for member in archive.infolist())) > LARGEST:
-            raise ValueError(f"it would unpack to {size} bytes, more than the {LARGEST} of hours of motion")
-    with np.load(path, allow_pickle=False) as archive:
-        return dict(archive)
 
 
 def concatenated(clips: Sequence[MotionClip]) -> MotionClip:

@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 
 from torchrl_mcp.cli import motion_files, motions
-from torchrl_mcp.envs.motions.capture.build import HUMANS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk
@@ -52,7 +51,8 @@ def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     assert clips["walk"].fps == pytest.approx(20)
     assert torch.equal(clips["walk_mirrored"].qpos, clips["walk"].mirrored().qpos)
     lines = output.splitlines()
-    measured = ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg", "0.0", "cm", "0.0", "cm"]
+    measured = ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg,", "0", "%"]
+    measured += ["0.0", "deg", "0.0", "cm", "0.0", "cm"]
     assert lines[1].split()[:-2] == measured
     assert lines[1].split()[-1] == "-"  # joints of the character itself have no rest pose
     assert lines[2].split()[4] == "0.30"
@@ -67,7 +67,8 @@ def test_clips_and_recordings_can_be_inspected(run, tmp_path):
     status, output, _ = run("inspect", "walk.npz")
     assert status == 0
     assert output.splitlines()[1].split()[:5] == ["walk", "biped", "1.00", "30", "loop"]
-    assert run("inspect", "walk.txt", "--character", "biped")[1] == output
+    of_recording = run("inspect", "walk.txt", "--character", "biped")[1]
+    assert of_recording.replace("0.0 deg, 0 %", "-").split() == output.split()  # a clip tells of no cut
     assert {path.name for path in tmp_path.iterdir()} == {"walk.txt", "walk.npz"}
 
 
@@ -128,6 +129,31 @@ def test_a_motion_whose_feet_slide_is_pointed_out(run, tmp_path):
     assert run("inspect", "skate.txt")[1].splitlines()[-1].startswith("The feet slide in skate: unit, frame rate,")
 
 
+def standing(turn):
+    """A person who stands along y in all frames, and along z before the root is turned about x."""
+    channels = "CHANNELS 3 Zrotation Yrotation Xrotation"
+    side = "".join(
+        f"JOINT {name}UpLeg {{\nOFFSET {x} 0 0\n{channels}\nJOINT {name}Leg {{\nOFFSET 0 0 -43\n{channels}\n"
+        f"JOINT {name}Foot {{\nOFFSET 0 0 -42\n{channels}\n}} }} }}\n"
+        for name, x in (("Left", 9), ("Right", -9))
+    )
+    root = f"ROOT Hips {{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition {channels[11:]}\n"
+    spine = f"JOINT Spine {{\nOFFSET 0 0 20\n{channels}\n}} }}\n"
+    row = f"0 92 0 0 0 {turn}{' 0' * 21}\n"
+    return f"HIERARCHY\n{root}{side}{spine}MOTION\nFrames: 9\nFrame Time: 0.0333\n{9 * row}"
+
+
+def test_what_was_assumed_about_the_vertical_is_said(run, tmp_path):
+    (tmp_path / "stand.bvh").write_text(standing(-90))
+    words = ["stand.bvh", "--character", "biped", "--map", "chest=Spine"]
+    status, output, errors = run("import", *words)
+    assert (status, errors) == (0, "")
+    assert "Assumed for stand: y points up, and the rest pose is turned by 90 degrees to stand along it" in output
+    clip = MotionClip.load("stand.npz")
+    assert clip.qpos[:, 2].min() > 0.8
+    assert "Assumed" not in run("inspect", *words, "--up", "y")[1]
+
+
 def corpus(folder, **seconds):
     """The files of the paper's corpus, in which nobody moves a limb."""
     (folder / "deep").mkdir(parents=True)
@@ -179,7 +205,12 @@ WRONG = {
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
     "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
     "no BVH": (["import", "broken.bvh"], r"broken\.bvh:1: does not begin with HIERARCHY"),
-    "wrong character": (["import", "a.bvh", "--character", "trex"], "invalid choice: 'trex'"),
+    "wrong character": (
+        ["import", "stand.txt", "--character", "trex"],
+        "character='trex' has not the joints of a human",
+    ),
+    "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
+    "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: give it \(--fps\)"),
     "wrong map": (["import", "broken.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
@@ -193,6 +224,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     (tmp_path / "broken.bvh").write_text("nothing")
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
     (tmp_path / "notes.md").write_text("nothing")
+    (tmp_path / "stand.csv").write_text("0,0,1,1,0,0,0\n" * 2)
     (tmp_path / "more").mkdir()
     for path in (tmp_path / "stand.txt", tmp_path / "more" / "stand.txt"):
         path.write_text(motion(1.0))
@@ -201,10 +233,6 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     assert output == ""
     assert re.search(message, errors)
     assert "Traceback" not in errors
-
-
-def test_the_characters_that_the_command_line_offers_are_those_with_a_human_body():
-    assert motions.HUMANS == HUMANS
 
 
 def test_help_shows_examples():

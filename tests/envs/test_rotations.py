@@ -17,6 +17,7 @@ from torchrl_mcp.envs.rotations import (
     inverse,
     multiply,
     rotate,
+    shortest,
     slerp,
     to_rotation_vector,
 )
@@ -96,6 +97,14 @@ def test_slerp_turns_about_one_axis_at_constant_speed(total):
     between = slerp(a.expand(7, 4), b.expand(7, 4), fraction)
     expected = multiply(a.expand(7, 4), from_rotation_vector(total * fraction.unsqueeze(-1) * axis))
     torch.testing.assert_close(between, expected)
+
+
+@pytest.mark.parametrize("b", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0.6, -0.8), (-0.96, 0, 0.28)])
+def test_the_shortest_rotation_from_one_direction_to_another_turns_by_the_angle_between_them(b):
+    a, b = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
+    turn = shortest(a, b)
+    torch.testing.assert_close(rotate(turn, a), b)
+    assert float(to_rotation_vector(turn).norm()) == pytest.approx(math.acos(float(a @ b)))
 
 
 def test_slerp_takes_the_shorter_way():

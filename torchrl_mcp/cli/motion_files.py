@@ -8,6 +8,7 @@ from pathlib import Path
 from torch import Tensor
 
 from torchrl_mcp.envs.motions import MotionClip
+from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.build import HUMANS
 from torchrl_mcp.envs.motions.capture.importer import Import, imported
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
@@ -38,6 +39,7 @@ COLUMNS = (
     "m/s",
     "|rad/s|",
     "slide m/s",
+    "cut to limits",
     "beyond limits",
     "below ground",
     "legs in legs",
@@ -85,7 +87,7 @@ def inspect_files(arguments: argparse.Namespace) -> None:
 def render_files(arguments: argparse.Namespace) -> None:
     """Draw a contact sheet and a film of each motion."""
     arguments.output.mkdir(parents=True, exist_ok=True)
-    for name, (clip, _) in _load(arguments).items():
+    for name, (clip, *_) in _load(arguments).items():
         sheet, film = arguments.output / f"{name}.png", arguments.output / f"{name}.gif"
         save_picture(contact_sheet(clip), sheet)
         save_film(clip, film, seconds=arguments.seconds)
@@ -117,8 +119,8 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
     for path in arguments.files:
         if path.stem in motions:
             raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
-        if path.suffix == ".npz":
-            motions[path.stem] = Import(MotionClip.load(path), math.nan)
+        if path.suffix == ".npz" and "character" in Archive(path).names:
+            motions[path.stem] = Import(MotionClip.load(path))
             continue
         motions[path.stem] = imported(
             path,
@@ -129,7 +131,11 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
             joint_map=_joint_map(arguments.map),
             skip=arguments.skip,
             rest_frame=arguments.rest_frame,
+            up=arguments.up,
             asf=arguments.asf,
+            body_model=arguments.body_model,
+            quaternion=arguments.quaternion,
+            joints=arguments.joints.split(",") if arguments.joints else None,
         )
     return motions
 
@@ -137,7 +143,7 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
 def _save(motions: Mapping[str, Import], folder: Path) -> None:
     """Write clips into a folder, and print a table about them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, (clip, _) in motions.items():
+    for name, (clip, *_) in motions.items():
         clip.save(folder / f"{name}.npz")
     print(f"{_table(motions)}\nwritten to {folder}")
 
@@ -145,16 +151,20 @@ def _save(motions: Mapping[str, Import], folder: Path) -> None:
 def _table(motions: Mapping[str, Import]) -> str:
     """Return a line for each clip, with a warning about clips whose feet slide."""
     summaries = {name: summarised(motion.clip) for name, motion in motions.items()}
-    rows = [_row(name, *motion, summaries[name]) for name, motion in motions.items()]
+    rows = [_row(name, motion, summaries[name]) for name, motion in motions.items()]
     total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
     rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
     lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
+    for name, motion in motions.items():
+        if motion.assumed:
+            lines += f"\nAssumed for {name}: {motion.assumed}. If this is wrong, say which axis points up (--up)."
     if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
         lines += f"\nThe feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
     return lines
 
 
-def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tuple[str, ...]:
+def _row(name: str, motion: Import, numbers: Summary) -> tuple[str, ...]:
+    clip, rest_lean, cut, _ = motion
     demand = feasibility(clip)
     return (
         name,
@@ -164,6 +174,7 @@ def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tup
         f"{numbers.speed:.2f}",
         f"{numbers.turn_rate:.2f}",
         "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
+        f"{float(cut.max()):.1f} deg, {100 * float((cut > 1).double().mean()):.0f} %" if len(cut) else "-",
         f"{math.degrees(demand.limit):.1f} deg",
         f"{100 * demand.penetration:.1f} cm",
         f"{100 * demand.crossing:.1f} cm",
@@ -175,7 +186,7 @@ def _row(name: str, clip: MotionClip, rest_lean: float, numbers: Summary) -> tup
 def _strides(motions: Mapping[str, Import]) -> str:
     """Return a line of medians over the complete strides of each clip of a human body."""
     rows = []
-    for name, (clip, _) in motions.items():
+    for name, (clip, *_) in motions.items():
         if clip.character in HUMANS:
             strides = gait_statistics(clip)
             medians = [

@@ -9,14 +9,14 @@ from torchrl_mcp.cli.parsing import interruptible, new_parser
 
 PROGRAM = "torchrl-mcp-motions"
 
-HUMANS = ("humanoid", "biped")
-"""Characters with a human body: ``torchrl_mcp.envs.motions.capture.build.HUMANS``, which takes seconds to import."""
-
 EXAMPLES = f"""\
-Files are BVH (.bvh), Acclaim (.amc, beside its .asf), DeepMimic (.json, .txt), or clips that this program wrote (.npz).
+Files are BVH (.bvh), Acclaim (.amc, beside its .asf), SMPL and AMASS (.npz), DeepMimic (.json, .txt), states of a
+character (.csv, .npz), or clips that this program wrote (.npz).
 
 examples:
   {PROGRAM} import walk.bvh 02_01.amc --character humanoid --output clips
+  {PROGRAM} import CMU/01/01_01_poses.npz --output clips
+  {PROGRAM} import walk.csv --character trex --fps 50 --quaternion xyzw
   {PROGRAM} import walk.bvh --scale 0.3048 --map left_knee=LKnee --map right_knee=RKnee
   {PROGRAM} inspect clips/*.npz --strides
   {PROGRAM} render clips/walk.npz --output pictures
@@ -55,7 +55,10 @@ def parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
     target.add_argument(
-        "--character", choices=HUMANS, default="humanoid", help="character of the clips (default humanoid)"
+        "--character",
+        default="humanoid",
+        metavar="NAME",
+        help="character of the clips: humanoid (default), biped, or any for states of its own",
     )
     target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
@@ -70,7 +73,11 @@ def parser() -> argparse.ArgumentParser:
     source.add_argument(
         "--rest-frame", type=int, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
     )
+    source.add_argument("--up", metavar="AXIS", help="axis of the files that points up: x, y, z; --up=-y for downwards")
     source.add_argument("--asf", type=Path, help="skeleton of .amc files, if not in their folder")
+    source.add_argument("--body-model", type=Path, help="body model (.npz) of SMPL files (default: the mean body)")
+    source.add_argument("--quaternion", choices=("wxyz", "xyzw"), help="order of the quaternions of files of joints")
+    source.add_argument("--joints", metavar="NAME,NAME,...", help="joints in the order of the columns of states")
 
     command = commands.add_parser("import", parents=[source, target], help="write clips (.npz)")
     command.add_argument("--mirror", action="store_true", help="write mirror images as well")

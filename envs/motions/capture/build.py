@@ -1,6 +1,8 @@
 """Building a clip from the motion of a human body's joints."""
 
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,6 +27,12 @@ LONGEST = 3600.0
 
 HIGHEST_RATE = 1000.0
 
+NO_ROTATION = 0.1
+"""Length below which a quaternion is no rotation; longer ones are normalised."""
+
+QUATERNIONS = ("wxyz", "xyzw")
+"""Orders of the components of quaternions in files."""
+
 
 def require_human(character: str) -> None:
     """Check that a character has the joints of a human body.
@@ -36,52 +44,72 @@ def require_human(character: str) -> None:
         raise ValueError(f"character={character!r} has not the joints of a human body: pass one of {', '.join(HUMANS)}")
 
 
-def assembled(
-    character: str, path: Tensor, motion: Mapping[str, Tensor], times: Tensor, *, rate: float, loop: bool = False
-) -> MotionClip:
-    """Make a clip of the motion of a human body's joints.
-
-    It begins at x = y = 0, with the soles on the ground, and respects the limits of the character's joints. Joints that
-    the character lacks are left out; joints that only the character has stay straight.
+class JointMotion(NamedTuple):
+    """Motion of a character's joints, not yet limited to what the character can do.
 
     Args:
-        character: ``"humanoid"`` or ``"biped"``.
         path: Position of the root, shape ``(T, 3)``, in metres.
-        motion: Motion by joint of the humanoid: quaternions relative to the parent, shape ``(T, 4)``, or angles in
-            radians, shape ``(T,)``; the root's quaternions are relative to the world.
+        joints: Motion by joint: quaternions relative to the parent, shape ``(T, 4)``, or angles in radians, shape
+            ``(T,)``; the root's quaternions are relative to the world. The biped's torso may be called ``chest``.
         times: Times of the states in seconds, increasing from 0, shape ``(T,)``.
-        rate: Frames per second of the clip; the nearest rate that divides its duration into whole frames is used.
         loop: Whether the motion repeats.
+    """
+
+    path: Tensor
+    joints: Mapping[str, Tensor]
+    times: Tensor
+    loop: bool = False
+
+
+def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[MotionClip, Tensor]:
+    """Make a clip of a motion, and measure what the limits of the character's joints cut off.
+
+    The clip begins at x = y = 0, with the soles on the ground. Joints that the character lacks are left out; joints
+    that only the character has stay straight.
+
+    Args:
+        character: Name of the character.
+        motion: The motion.
+        rate: Frames per second of the clip; the nearest rate that divides its duration into whole frames is used.
+
+    Returns:
+        The clip, and the greatest angle in radians by which a joint of each frame was cut, shape ``(T,)``.
 
     Raises:
         ValueError: If fewer than two frames would remain at this rate.
     """
-    duration = float(times[-1])
+    duration = float(motion.times[-1])
     steps = round(duration * rate) if 0 < rate <= HIGHEST_RATE else 0
     if steps < 1:
         raise ValueError(
             f"rate={rate} leaves less than two frames of {duration:g} s: pass a higher one, up to {HIGHEST_RATE:g}"
         )
-    frames = np.interp(np.linspace(0, duration, steps + 1), times.numpy(), np.arange(len(times)))
-    by_frame = MotionClip(character, grounded(character, states(character, path, motion)), fps=1.0)
-    return MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, loop)
+    frames = np.interp(np.linspace(0, duration, steps + 1), motion.times.numpy(), np.arange(len(motion.times)))
+    qpos, cut = states(character, motion)
+    by_frame = MotionClip(character, grounded(character, qpos), fps=1.0)
+    return MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, motion.loop), cut
 
 
-def states(character: str, path: Tensor, motion: Mapping[str, Tensor]) -> Tensor:
-    """States in MuJoCo's order, with joints within their limits, shape ``(T, nq)``; see :func:`assembled`."""
+def states(character: str, motion: JointMotion) -> tuple[Tensor, Tensor]:
+    """States in MuJoCo's order with joints within their limits, ``(T, nq)``, and the angles cut from each, ``(T,)``."""
     model = character_model(character)
-    qpos = torch.from_numpy(model.qpos0).repeat(len(path), 1)
-    qpos[:, :3], qpos[:, 3:7] = path, motion["root"]
+    qpos = torch.from_numpy(model.qpos0).repeat(len(motion.path), 1)
+    qpos[:, :3], qpos[:, 3:7] = motion.path, motion.joints["root"]
+    cut = torch.zeros(len(qpos), dtype=torch.float64)
     for index in range(1, model.njnt):
         joint = model.joint(index)
-        name = "chest" if joint.name == "torso" else joint.name
-        if name in motion:
-            place, (low, high) = joint.qposadr[0], joint.range
-            if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
-                qpos[:, place : place + 4] = _within(motion[name], high)
-            else:
-                qpos[:, place] = motion[name].clamp(low, high)
-    return qpos
+        name = "chest" if joint.name == "torso" and "chest" in motion.joints else joint.name
+        if name not in motion.joints:
+            continue
+        values, place = motion.joints[name], joint.qposadr[0]
+        low, high = joint.range if model.jnt_limited[index] else (-math.inf, math.inf)
+        if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
+            qpos[:, place : place + 4], excess = _within(values, high)
+        else:
+            qpos[:, place] = values.clamp(low, high)
+            excess = (values - qpos[:, place]).abs()
+        cut = torch.maximum(cut, excess)
+    return qpos, cut
 
 
 def grounded(character: str, qpos: Tensor) -> Tensor:
@@ -112,8 +140,9 @@ def speeds(path: Tensor, times: Tensor) -> Tensor:
     return torch.linalg.vector_norm(path.diff(dim=0), dim=-1) / times.diff()
 
 
-def _within(rotation: Tensor, limit: float) -> Tensor:
-    """Clamp the angle of rotations, shape ``(T, 4)``."""
+def _within(rotation: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Clamp the angle of rotations, shape ``(T, 4)``, and return what is cut, shape ``(T,)``."""
     vector = to_rotation_vector(rotation)
     angle = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
-    return torch.where(angle > limit, from_rotation_vector(vector * (limit / angle)), rotation)
+    clamped = torch.where(angle > limit, from_rotation_vector(vector * (limit / angle)), rotation)
+    return clamped, (angle - limit).clamp_min(0).squeeze(-1)

@@ -53,7 +53,7 @@ def read_bvh(path: str | Path, *, fps: float | None = None) -> SourceMotion:
     file = TextFile.read(path)
     statements = file.statements(separators="{}")
     joints = _hierarchy(file, takewhile(lambda statement: statement.words[0].upper() != "MOTION", statements))
-    seconds, values, lines = _motion(file, statements, joints)
+    rate, values, lines = _motion(file, statements, joints, fps)
     translations, rotations = _transforms(joints, values)
     return SourceMotion(
         path=file.path,
@@ -61,7 +61,7 @@ def read_bvh(path: str | Path, *, fps: float | None = None) -> SourceMotion:
         parents=[joint.parent for joint in joints],
         translations=translations,
         rotations=rotations,
-        fps=frame_rate(fps, 1 / seconds),
+        fps=rate,
         unit=None,
         lines=lines,
     )
@@ -129,12 +129,11 @@ def _declared_channels(file: TextFile, statement: Statement) -> list[tuple[str, 
 
 
 def _motion(
-    file: TextFile, statements: Iterator[Statement], joints: Sequence[_Joint]
+    file: TextFile, statements: Iterator[Statement], joints: Sequence[_Joint], fps: float | None
 ) -> tuple[float, Tensor, Sequence[int]]:
-    """Read the part after ``MOTION``: seconds per frame, channels, shape ``(T, C)``, and the lines of the frames."""
-    frames, (seconds, line) = _header(file, statements, "Frames"), _header(file, statements, "Frame Time")
-    if not FRAME_TIMES[0] <= seconds <= FRAME_TIMES[1]:
-        raise file.error(f"Frame Time is {seconds:g} s: correct it to {FRAME_TIMES[0]:g} to {FRAME_TIMES[1]:g} s", line)
+    """Read the part after ``MOTION``: frames per second, channels, shape ``(T, C)``, and the lines of the frames."""
+    frames, time = _header(file, statements, "Frames"), _header(file, statements, "Frame Time")
+    rate = frame_rate(fps, _stated_rate(file, time) if fps is None else 1.0)
     width = sum(len(joint.channels) for joint in joints)
     values, lines = array("d"), array("q")
     for line, words in statements:
@@ -142,22 +141,32 @@ def _motion(
             raise file.error(f"has {len(words)} numbers, and the skeleton has {width} channels: correct it", line)
         values.extend(file.numbers(words, line))
         lines.append(line)
-    declared, line = frames
+    declared = file.number(frames)
     if declared != len(lines) or len(lines) < 2:
-        raise file.error(f"{declared:g} frames are declared, {len(lines)} follow: they should be equal, and >= 2", line)
+        message = f"{declared:g} frames are declared, {len(lines)} follow: they should be equal, and >= 2"
+        raise file.error(message, frames.line)
     file.require_size(len(lines), len(joints))
-    return seconds, torch.tensor(values, dtype=torch.float64).view(len(lines), width), lines
+    return rate, torch.tensor(values, dtype=torch.float64).view(len(lines), width), lines
 
 
-def _header(file: TextFile, statements: Iterator[Statement], key: str) -> tuple[float, int]:
-    """Read ``key: number``, and return the number and its line."""
+def _header(file: TextFile, statements: Iterator[Statement], key: str) -> Statement:
+    """Read ``key: word``."""
     statement = next(statements, None)
     if statement is None:
         raise file.error(f"has no '{key}:': the file is cut short", file.text.count("\n") + 1)
     name, _, value = " ".join(statement.words).partition(":")
     if name.strip().lower() != key.lower() or len(value.split()) != 1:
         raise file.error(f"here should be '{key}:' and a number: correct it", statement.line)
-    return file.numbers(value.split(), statement.line)[0], statement.line
+    return Statement(statement.line, [key, *value.split()])
+
+
+def _stated_rate(file: TextFile, time: Statement) -> float:
+    """Frames per second by the file's own ``Frame Time``."""
+    seconds, (shortest, longest) = file.number(time), FRAME_TIMES
+    if not shortest <= seconds <= longest:
+        message = f"Frame Time is {seconds:g} s: correct it to {shortest:g} to {longest:g} s, or give the rate (--fps)"
+        raise file.error(message, time.line)
+    return 1 / seconds
 
 
 def _transforms(joints: Sequence[_Joint], values: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,10 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.capture.build import LONGEST, TOP_SPEED, assembled, require_human, speeds
+from torchrl_mcp.envs.motions.capture.build import LONGEST, NO_ROTATION, TOP_SPEED, JointMotion, speeds
 from torchrl_mcp.envs.motions.capture.skeleton import frame_rate
 from torchrl_mcp.envs.motions.capture.textfile import LARGEST_NUMBER, TextFile, shortened
-from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.rotations import from_rotation_vector, inverse, multiply, to_rotation_vector
 
 RIGHT_LEG, LEFT_LEG = ({f"{side}_hip": 4, f"{side}_knee": 1, f"{side}_ankle": 4} for side in ("right", "left"))
@@ -25,21 +24,21 @@ LAYOUTS = {4 + sum(joints.values()): joints for joints in (HUMANOID, BIPED)}
 """Joints by length of a frame."""
 
 
-def read_deepmimic(path: str | Path, character: str, *, rate: float = 30.0, fps: float | None = None) -> MotionClip:
+def read_deepmimic(path: str | Path, *, fps: float | None = None, quaternion: str = "wxyz") -> JointMotion:
     """Read a motion of DeepMimic's humanoid (44 numbers a frame) or of DeepLoco's biped (30).
 
-    Their axes, x forward, y up, z right, become x forward, y left, z up. The clip begins at x = y = 0, on the ground.
-    The joints keep their rotations, within the limits of the character; joints that the file lacks stay straight, and
-    joints that the character lacks are left out.
+    Their axes, x forward, y up, z right, become x forward, y left, z up.
 
     A motion that wraps continues from the position of its end with the orientation of its beginning. Its last frame
     approximately repeats the first; the difference is spread evenly over the cycle.
 
     Args:
         path: The file.
-        character: ``"humanoid"`` or ``"biped"``; both can read the files of both.
-        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
         fps: Frames per second of the file, or None for the file's own durations.
+        quaternion: Order of the components of quaternions, ``"wxyz"`` or ``"xyzw"``.
+
+    Returns:
+        The motion by the joints of the humanoid; the humanoid and the biped can use both.
 
     Raises:
         MotionFormatError: If the file has another format, or is damaged.
@@ -49,18 +48,17 @@ def read_deepmimic(path: str | Path, character: str, *, rate: float = 30.0, fps:
         Peng et al., DeepMimic: Example-Guided Deep Reinforcement Learning of Physics-Based Character Skills, 2018,
         https://github.com/xbpeng/DeepMimic
     """
-    require_human(character)
     file = TextFile.read(path)
     frames, loop = _content(file)
-    root, motion = _motion(file, frames)
-    times = _times(file, frames[:, 0] if fps is None else torch.full_like(frames[:, 0], 1 / frame_rate(fps)))
+    root, motion = _motion(file, frames, quaternion)
+    times = _times(file, frames[:, 0] if fps is None else torch.full_like(frames[:, 0], 1 / frame_rate(fps, 1.0)))
     _require_no_jump(file, root, times)
     if loop:
         root[:, 2] = _closed(root[:, 2])
         motion = {
             joint: _closed(values) if values.ndim == 1 else _closed_turns(values) for joint, values in motion.items()
         }
-    return assembled(character, root, motion, times, rate=rate, loop=loop)
+    return JointMotion(root, motion, times, loop)
 
 
 def _content(file: TextFile) -> tuple[Tensor, bool]:
@@ -113,21 +111,22 @@ def _times(file: TextFile, durations: Tensor) -> Tensor:
     return times
 
 
-def _motion(file: TextFile, frames: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+def _motion(file: TextFile, frames: Tensor, quaternion: str) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the path of the root, shape ``(T, 3)``, and quaternions or angles by joint, in this library's axes."""
     layout = LAYOUTS[frames.shape[1]]
     _, path, *columns = frames.split([1, 3, *layout.values()], dim=-1)
+    axes = [quaternion.index(component) for component in "wxzy"]
     motion = {}
     for joint, column in zip(layout, columns, strict=True):
         if layout[joint] == 1:
             motion[joint] = column.squeeze(-1)
             continue
         length = torch.linalg.vector_norm(column, dim=-1, keepdim=True)
-        if ((length - 1).abs() > 0.05).any():
-            frame = int(((length - 1).abs() > 0.05).nonzero()[0, 0])
+        if (length < NO_ROTATION).any():
+            frame = int((length < NO_ROTATION).nonzero()[0, 0])
             message = f"the quaternion of the {joint} in frame {frame + 1} has length {length[frame, 0]:g}: correct it"
             raise file.error(message, _line(file, frame))
-        motion[joint] = column[:, [0, 1, 3, 2]] / length * column.new_tensor([1.0, 1.0, -1.0, 1.0])
+        motion[joint] = column[:, axes] / length * column.new_tensor([1.0, 1.0, -1.0, 1.0])
     return path[:, [0, 2, 1]] * path.new_tensor([1.0, -1.0, 1.0]), motion
 
 

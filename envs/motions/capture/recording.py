@@ -10,8 +10,8 @@ from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, LEG, bones, find_joints
 from torchrl_mcp.envs.motions.capture.build import LONGEST, TOP_SPEED, speeds
-from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
-from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
+from torchrl_mcp.envs.motions.capture.upright import upright
 from torchrl_mcp.envs.rotations import inverse, multiply
 
 UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
@@ -23,6 +23,9 @@ LEG_LENGTHS = (0.7, 1.0)
 SHORTEST_TRUNK = 0.1
 """Metres from hips to chest below which the line between them does not determine the lean of the trunk."""
 
+SHORTEST_BONE = 0.06
+"""Length of a bone of a limb, in lengths of the legs, below which it determines no direction."""
+
 
 class Recording(NamedTuple):
     """Parts of a body, by name, in metres and the character's axes: x forward, y left, z up while it stands.
@@ -32,12 +35,14 @@ class Recording(NamedTuple):
         turns: Rotation of each part from the standing pose, shape ``(T, 4)``.
         standing: Position of each part's beginning in the standing pose, shape ``(3,)``.
         times: Times of the frames in seconds, from 0, shape ``(T,)``.
+        assumed: What was assumed about the standing pose against that of the file, as a sentence; or nothing.
     """
 
     positions: Mapping[str, Tensor]
     turns: Mapping[str, Tensor]
     standing: Mapping[str, Tensor]
     times: Tensor
+    assumed: str
 
     def direction(self, start: str, end: str) -> Tensor:
         """Unit vectors from one part's beginning to another's, shape ``(T, 3)``."""
@@ -67,18 +72,18 @@ def record(
     parts: Sequence[str],
     *,
     scale: float | None = None,
+    up: str | None = None,
     joint_map: Mapping[str, str] | None = None,
     skip: int = 0,
     rest_frame: int | None = None,
 ) -> Recording:
     """Find the parts of a body in a motion; see :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`."""
     joints = find_joints(source, parts, joint_map)
-    rest = source.rest if rest_frame is None else source.pose(rest_frame)
-    source = source.without_first(skip)
+    whole, source = source, source.without_first(skip)
     _require_end(source)
     pose = source.poses()
-    named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"
-    axes = _standing_axes(source, {part: rest.positions[joint] for part, joint in joints.items()}, named)
+    rest = whole.rest if rest_frame is None else whole.pose(rest_frame)
+    rest, axes, assumed = upright(source, joints, rest, pose, up=up, rest_frame=rest_frame)
     metres = _metres_per_unit(source, {part: pose.positions[:, joint] for part, joint in joints.items()}, scale)
     positions, standing = metres * pose.positions @ axes.mT, metres * rest.positions @ axes.mT
     turns = multiply(pose.rotations, inverse(rest.rotations).expand_as(pose.rotations))
@@ -87,7 +92,8 @@ def record(
         positions={part: positions[:, joint] for part, joint in joints.items()},
         turns={part: turns[:, joint] for part, joint in joints.items()},
         standing={part: standing[joint] for part, joint in joints.items()},
-        times=torch.arange(len(source.lines), dtype=torch.float64) / source.fps,
+        times=torch.arange(len(source.rotations), dtype=torch.float64) / source.fps,
+        assumed=assumed,
     )
     _require_bones(source, recording)
     _require_no_jump(source, recording)
@@ -95,41 +101,24 @@ def record(
 
 
 def _require_end(source: SourceMotion) -> None:
-    seconds = (len(source.lines) - 1) / source.fps
+    seconds = (len(source.rotations) - 1) / source.fps
     if seconds > LONGEST:
-        raise MotionFormatError(source.path, f"lasts {seconds:.0f} s, more than an hour: correct the rate, or split it")
-
-
-def _standing_axes(source: SourceMotion, rest: Mapping[str, Tensor], named: str) -> Tensor:
-    """Forward, left and up in the axes of the source, the rows of a rotation matrix, shape ``(3, 3)``."""
-    upwards = rest["right_hip"] + rest["left_hip"] - rest["right_ankle"] - rest["left_ankle"]
-    main = int(upwards.abs().argmax())
-    up = AXES[main] * upwards[main].sign()
-    across = rest["left_hip"] - rest["right_hip"]
-    left = normalize(across - (across @ up) * up, dim=-1)
-    legs = [float(normalize(rest[end] - rest[start], dim=-1) @ up) for start, end in bones(LEG)]
-    arms = [float(normalize(rest[end] - rest[start], dim=-1) @ up) for start, end in bones(ARM) if start in rest]
-    if max(legs) > -0.5 or max(arms, default=0.0) > 0.9 or not left.any():
-        raise MotionFormatError(
-            source.path,
-            f"{named} does not stand with the legs straight and the arms down or to the sides: take a frame that does "
-            "instead, such as the first with --rest-frame 0, or say with a map which joints are which",
-        )
-    return torch.stack([torch.linalg.cross(left, up), left, up])
+        raise source.error(f"lasts {seconds:.0f} s, more than an hour: correct the rate, or split it")
 
 
 def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scale: float | None) -> float:
-    """Choose the unit, and check that it fits the length of the legs."""
-    if scale is not None and not 0 < scale < math.inf:
-        raise ValueError(f"scale={scale} is no unit of length: pass metres per unit, such as 0.01 for centimetres")
+    """Return the user's unit, or else the one of the file or a usual one that fits the length of the legs."""
+    if scale is not None:
+        if not 0 < scale < math.inf:
+            raise ValueError(f"scale={scale} is no unit of length: pass metres per unit, such as 0.01 for centimetres")
+        return scale
     length, (low, high) = _leg_length(positions), LEG_LENGTHS
     fitting = [unit for unit in UNITS if low <= unit * length <= high]
-    metres = scale or source.unit or (fitting[0] if fitting else 1.0)
+    metres = source.unit or (fitting[0] if fitting else 1.0)
     if not low <= metres * length <= high:
-        raise MotionFormatError(
-            source.path,
+        raise source.error(
             f"from hip to ankle it measures {length:.4g} units, which at {metres:.4g} m each are "
-            f"{metres * length:.3g} m and should be {low} to {high} m: give the scale, in metres per unit",
+            f"{metres * length:.3g} m and should be {low} to {high} m: give the scale, in metres per unit"
         )
     return metres
 
@@ -141,12 +130,15 @@ def _leg_length(positions: Mapping[str, Tensor]) -> float:
 
 def _require_bones(source: SourceMotion, recording: Recording) -> None:
     """Check that all limbs have a length, and thus a direction."""
+    shortest = SHORTEST_BONE * recording.leg_length()
     for start, end in (*bones(LEG), *bones(ARM)):
         if start in recording.positions:
             lengths = torch.linalg.vector_norm(recording.positions[end] - recording.positions[start], dim=-1)
-            if lengths.min() < 0.05:
-                message = f"{start} and {end} come closer than 5 cm: say with a map which joints they are"
-                raise MotionFormatError(source.path, message, source.lines[int(lengths.argmin())])
+            if not lengths.min() > shortest:
+                message = (
+                    f"{start} and {end} come closer than {100 * shortest:.3g} cm: say with a map which joints they are"
+                )
+                raise source.error(message, int(lengths.argmin()))
 
 
 def _require_no_jump(source: SourceMotion, recording: Recording) -> None:
@@ -157,9 +149,8 @@ def _require_no_jump(source: SourceMotion, recording: Recording) -> None:
             frame = int(fast.nonzero()[0]) + 1
             first = "leave out the first, which seems to be a T-pose (skip)"
             other = "cut the file there, or correct the order of its rotations"
-            raise MotionFormatError(
-                source.path,
-                f"{part} jumps between frames {frame} and {frame + 1}, faster than {TOP_SPEED:g} m/s: "
-                f"{first if frame == 1 else other}",
-                source.lines[frame],
+            raise source.error(
+                f"{part} jumps between frames {frame} and {frame + 1}, faster than {TOP_SPEED:g} m/s at "
+                f"{source.fps:g} frames/s: {first if frame == 1 else other}",
+                frame,
             )

@@ -10,11 +10,10 @@ from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, SIDES, TRUNK, limb
-from torchrl_mcp.envs.motions.capture.build import assembled, require_human, speeds
+from torchrl_mcp.envs.motions.capture.build import JointMotion, require_human, speeds
 from torchrl_mcp.envs.motions.capture.recording import Recording, record
 from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
-from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate
+from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate, shortest
 
 BENT = math.radians(15)
 """Least flexion in radians at which a knee or an elbow determines its plane."""
@@ -33,32 +32,32 @@ def retarget(
     character: str,
     *,
     scale: float | None = None,
-    rate: float = 30.0,
+    up: str | None = None,
     joint_map: Mapping[str, str] | None = None,
     skip: int = 0,
     rest_frame: int | None = None,
-) -> tuple[MotionClip, float]:
-    """Retarget a recorded motion to the humanoid or the biped, and measure the lean of its rest pose.
+) -> tuple[JointMotion, Recording]:
+    """Retarget a recorded motion to the humanoid or the biped.
 
     Parts of the character turn like the parts of the recorded body, relative to a standing pose with legs and arms
     straight down. A bone with another direction in the source's rest pose, such as the arms in a T-pose, is first
     brought there by the shortest rotation. Knees and elbows are hinges: they flex by the angle between the bones, and
     thigh and upper arm are twisted so that the hinge is normal to the plane of the limb. The root follows the middle of
-    the hips; its path is scaled by the length of the legs. A constant rotation makes each foot flat, and a constant
-    shift puts the clip on the ground.
+    the hips; its path is scaled by the length of the legs. A constant rotation makes each foot flat.
 
     Args:
         source: The motion.
         character: ``"humanoid"``, or ``"biped"``, which has neither head nor arms.
         scale: Metres per unit of the source, or None for the file's unit or else one that fits the legs' length.
-        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
+        up: Axis of the source that points up, such as ``"z"``; None to find it, see
+            :func:`~torchrl_mcp.envs.motions.capture.upright.upright`.
         joint_map: See :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints`.
         skip: Frames to leave out at the beginning.
         rest_frame: Frame, from 0 and before any are left out, in which the source stands upright, for sources whose
             rest pose does not stand upright.
 
     Returns:
-        The clip, and :meth:`Recording.lean` of the pose that was taken for standing.
+        The motion of the character's joints, and the recording in the character's axes.
 
     Raises:
         MotionFormatError: If the build, size or speed is impossible for a human body.
@@ -67,7 +66,7 @@ def retarget(
     require_human(character)
     has_arms = character == "humanoid"
     parts = (*TRUNK, *LEGS, *(HEAD_AND_ARMS if has_arms else ()))
-    body = record(source, parts, scale=scale, joint_map=joint_map, skip=skip, rest_frame=rest_frame)
+    body = record(source, parts, scale=scale, up=up, joint_map=joint_map, skip=skip, rest_frame=rest_frame)
     root, chest = body.turns["root"], body.turns["chest"]
     motion = {"root": root, "chest": _relative(root, chest)}
     for side in SIDES:
@@ -84,7 +83,7 @@ def retarget(
     hips = (body.positions["right_hip"] + body.positions["left_hip"]) / 2
     hips[:, 2] -= hips[:, :2] @ _slope(body)
     path = hips * (leg_length(character) / body.leg_length())
-    return assembled(character, path, motion, body.times, rate=rate), body.lean()
+    return JointMotion(path, motion, body.times), body
 
 
 def leg_length(character: str) -> float:
@@ -123,22 +122,12 @@ def _hinged(body: Recording, joints: tuple[str, str, str], *, forward: float) ->
     """
     start, middle, end = joints
     standing = normalize(body.standing[middle] - body.standing[start], dim=-1)
-    upper = multiply(body.turns[start], _shortest(-UP, standing).expand_as(body.turns[start]))
+    upper = multiply(body.turns[start], shortest(-UP, standing).expand_as(body.turns[start]))
     bone = body.direction(start, middle)
-    upper = multiply(
-        _shortest(rotate(upper, -UP.expand_as(bone)), bone), upper
-    )  # for bones that position channels move
+    upper = multiply(shortest(rotate(upper, -UP.expand_as(bone)), bone), upper)  # for bones that position channels move
     x, y, z = rotate(inverse(upper), body.direction(middle, end)).unbind(-1)
     twist = _interpolated(torch.atan2(forward * y, forward * x), torch.atan2(torch.hypot(x, y), -z) > BENT)
     return multiply(upper, about_z(twist)), torch.atan2(x * twist.cos() + y * twist.sin(), -z)
-
-
-def _shortest(a: Tensor, b: Tensor) -> Tensor:
-    """Shortest rotation from one unit vector to another, shape ``(*B, 4)``."""
-    turn = torch.cat([1 + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], dim=-1)
-    across = torch.linalg.cross(a, torch.where(a[..., :1].abs() < 0.9, AXES[0], AXES[1]))
-    half_turn = torch.cat([torch.zeros_like(across[..., :1]), across], dim=-1)
-    return normalize(torch.where(turn.norm(dim=-1, keepdim=True) < 1e-9, half_turn, turn), dim=-1)
 
 
 def _interpolated(angles: Tensor, known: Tensor) -> Tensor:
@@ -156,7 +145,7 @@ def _flat(body: Recording, ankle: str) -> Tensor:
     if not len(still):
         return foot
     normal = rotate(inverse(still), UP.expand(len(still), 3)).median(dim=0).values
-    return multiply(foot, _shortest(UP, normalize(normal, dim=-1)).expand_as(foot))
+    return multiply(foot, shortest(UP, normalize(normal, dim=-1)).expand_as(foot))
 
 
 def _slope(body: Recording) -> Tensor:

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, overload
 
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.rotations import multiply, rotate
 
 AXES = torch.eye(3, dtype=torch.float64)
@@ -40,7 +41,8 @@ class SourceMotion:
         rotations: Rotation of each joint relative to its parent, shape ``(T, J, 4)``.
         fps: Frames per second.
         unit: Metres per unit of length, or None if unknown.
-        lines: Line at which each frame begins.
+        lines: Line at which each frame begins; None for files that are no text.
+        up: Axis that the format prescribes as the vertical, such as ``"z"``; None if it prescribes none.
     """
 
     path: Path
@@ -50,7 +52,8 @@ class SourceMotion:
     rotations: Tensor
     fps: float
     unit: float | None
-    lines: Sequence[int]
+    lines: Sequence[int] | None = None
+    up: str | None = None
 
     @property
     def rest(self) -> Pose:
@@ -67,8 +70,8 @@ class SourceMotion:
         Raises:
             ValueError: If there is no such frame.
         """
-        if not 0 <= frame < len(self.lines):
-            raise ValueError(f"rest_frame={frame} does not exist: pass one of 0..{len(self.lines) - 1}")
+        if not 0 <= frame < len(self.rotations):
+            raise ValueError(f"rest_frame={frame} does not exist: pass one of 0..{len(self.rotations) - 1}")
         return _forward_kinematics(self.parents, self.translations[frame], self.rotations[frame])
 
     def without_first(self, frames: int) -> Self:
@@ -77,14 +80,20 @@ class SourceMotion:
         Raises:
             ValueError: If fewer than two frames would remain.
         """
-        if not 0 <= frames <= len(self.lines) - 2:
-            raise ValueError(f"skip={frames} leaves less than two frames of {len(self.lines)}: pass a smaller number")
+        if not 0 <= frames <= len(self.rotations) - 2:
+            raise ValueError(
+                f"skip={frames} leaves less than two frames of {len(self.rotations)}: pass a smaller number"
+            )
         return replace(
             self,
             translations=self.translations[frames:],
             rotations=self.rotations[frames:],
-            lines=self.lines[frames:],
+            lines=self.lines and self.lines[frames:],
         )
+
+    def error(self, message: str, frame: int | None = None) -> MotionFormatError:
+        """Return an error about this file, with the line of a frame, from 0."""
+        return MotionFormatError(self.path, message, self.lines[frame] if self.lines and frame is not None else None)
 
     def ancestors(self, joint: int) -> list[int]:
         """Return the joint itself, its parent and so on up to the root."""
@@ -94,7 +103,11 @@ class SourceMotion:
         return chain
 
 
-def frame_rate(fps: float | None, stated: float = 0.0) -> float:
+@overload
+def frame_rate(fps: float | None, stated: float) -> float: ...
+@overload
+def frame_rate(fps: float | None, stated: float | None) -> float | None: ...
+def frame_rate(fps: float | None, stated: float | None) -> float | None:
     """Return the user's frames per second, or else the file's.
 
     Raises:

@@ -85,7 +85,7 @@ class TextFile:
         Raises:
             MotionFormatError: If a word is not a finite number.
         """
-        numbers = [_number(word) for word in words]
+        numbers = [parsed(word) for word in words]
         for word, number in zip(words, numbers, strict=True):
             if number is None:
                 raise self.error(f"{shortened(word)} is no number: correct it", line)
@@ -135,7 +135,8 @@ def shortened(word: str) -> str:
     return repr(word if len(word) <= 30 else f"{word[:27]}...")
 
 
-def _number(word: str) -> float | None:
+def parsed(word: str) -> float | None:
+    """Return a word as a number, or None if it is none."""
     try:
         return float(word)
     except ValueError:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_mcp.envs.motions.capture import textfile
-from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 BALL, HINGE = [1.0, 0.0, 0.0, 0.0], [0.0]
@@ -65,6 +65,7 @@ WRONG = {
     "negative duration": (damaged(0, -0.1), 4, "frame 2 lasts -0.1 s"),
     "endless duration": (damaged(0, 9e6), 4, "frame 2 ends after 9e\\+06 s, more than an hour"),
     "no rotation": (damaged(4, 0.0), 4, "quaternion of the root in frame 2 has length 0"),
+    "hardly a rotation": (damaged(4, 0.05), 4, "quaternion of the root in frame 2 has length 0.05"),
     "jump": (lines(JUMP), 4, "the root jumps between frames 1 and 2"),
     "nested": ("[" * 100_000, 1, "is not JSON of a motion"),
     "digits": ('{"Frames": [[' + "9" * 5000 + "]]}", 1, "is not JSON of a motion"),
@@ -75,14 +76,14 @@ WRONG = {
 def test_what_is_wrong_is_said_with_file_and_line(write, text, line, message):
     path = write(text)
     with pytest.raises(MotionFormatError, match=message) as caught:
-        read_deepmimic(path, "humanoid")
+        import_motion(path, "humanoid")
     assert str(caught.value).startswith(f"{path}:{line}: ")
 
 
 def test_a_file_too_large_to_be_a_motion_is_not_parsed(write, monkeypatch):
     monkeypatch.setattr(textfile, "LARGEST_FILE", 2**20)
     with pytest.raises(MotionFormatError, match="larger than 1 MiB"):
-        read_deepmimic(write("[]," * 2**19), "humanoid")
+        import_motion(write("[]," * 2**19), "humanoid")
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_a_file_too_large_to_be_a_motion_is_not_parsed(write, monkeypatch):
 )
 def test_arguments_out_of_range_are_named(write, options, message):
     with pytest.raises(ValueError, match=message):
-        read_deepmimic(write(lines(STANDING)), **{"character": "humanoid", **options})
+        import_motion(write(lines(STANDING)), **{"character": "humanoid", **options})
 
 
 VALUES = st.recursive(
@@ -114,7 +115,7 @@ def test_no_damage_raises_another_error(tmp_path_factory, damages, loop, cut):
     path = tmp_path_factory.getbasetemp() / "damaged.txt"
     path.write_text(json.dumps({"Loop": loop, "Frames": frames})[: 3000 - cut])
     with suppress(MotionFormatError):
-        read_deepmimic(path, "humanoid")
+        import_motion(path, "humanoid")
     path.write_text(json.dumps({"Loop": "wrap", "Frames": frames}))
     with suppress(MotionFormatError):
-        read_deepmimic(path, "biped")
+        import_motion(path, "biped")

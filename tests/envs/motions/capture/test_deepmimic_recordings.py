@@ -4,9 +4,11 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.capture.importer import import_motion, imported
+from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 FILES = {
     "deepmimic/humanoid3d_walk.txt": (1.27, True),
@@ -22,7 +24,7 @@ FILES = {
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("character", ["humanoid", "biped"])
 def test_real_files_have_their_duration_and_stand_on_the_ground(mocap, file, character, kinematics):
-    clip = read_deepmimic(mocap / file, character)
+    clip = import_motion(mocap / file, character)
     duration, loop = FILES[file]
     assert clip.duration == pytest.approx(duration, abs=0.01)
     assert clip.loop is loop
@@ -30,6 +32,24 @@ def test_real_files_have_their_duration_and_stand_on_the_ground(mocap, file, cha
     ankles = np.array([min(found["left_ankle"][2], found["right_ankle"][2]) for found in places])
     assert 0.04 < np.quantile(ankles, 0.1) < 0.08
     assert ankles.min() > 0.03
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if not file.startswith("biped")])
+def test_real_files_with_reordered_quaternions_are_refused_or_read_as_told(mocap, file, tmp_path):
+    content = json.loads((mocap / file).read_text())
+    widths = [4, 4, 4, *[4, 1, 4, 4, 1] * 2]
+    starts = 4 + np.cumsum([0, *widths[:-1]])
+    order = [0, 1, 2, 3]
+    for start, width in zip(starts, widths, strict=True):
+        order += [start + 1, start + 2, start + 3, start] if width == 4 else [start]
+    content["Frames"] = np.array(content["Frames"])[:, order].tolist()
+    (tmp_path / "reordered.txt").write_text(json.dumps(content))
+    with pytest.raises(MotionFormatError, match=r"reordered\.txt: in (9\d|100) % of its frames .* up to 12\d: "):
+        import_motion(tmp_path / "reordered.txt", "humanoid")
+    found = imported(tmp_path / "reordered.txt", "humanoid", quaternion="xyzw")
+    expected = imported(mocap / file, "humanoid")
+    torch.testing.assert_close(found.clip.qpos, expected.clip.qpos, rtol=0, atol=1e-12)
+    assert expected.cut.max() < 8
 
 
 @pytest.mark.parametrize(
@@ -44,7 +64,7 @@ def test_bodies_are_where_the_skeleton_of_a_real_file_has_them(mocap, file, skel
     joints = json.loads((mocap / skeleton).read_text())["Skeleton"]["Joints"]
     frames = json.loads((mocap / file).read_text())["Frames"]
     step = max(1, len(frames) // 30)
-    clip = read_deepmimic(mocap / file, character, rate=(len(frames) - 1) / sum(frame[0] for frame in frames[:-1]))
+    clip = import_motion(mocap / file, character, rate=(len(frames) - 1) / sum(frame[0] for frame in frames[:-1]))
     start = None
     for index in range(0, len(frames), step):
         places = skeleton_positions(joints, frames[index])

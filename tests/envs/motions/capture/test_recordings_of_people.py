@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
-from torchrl_mcp.envs.motions.capture.importer import import_motion
+from torchrl_mcp.envs.motions.capture.importer import import_motion, imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.inspection.statistics import gait_statistics
 from torchrl_mcp.envs.motions.inspection.summary import foot_slide
@@ -34,6 +34,30 @@ def sfu(mocap):
 @pytest.fixture(scope="module")
 def sfu_clip(sfu):
     return import_motion(sfu, "humanoid")
+
+
+NUMBERS = {
+    "biped/biped3d_walk.txt": (379.9806715809617, 286.8965673638345),
+    "cmu/02_01.amc": (1361.6571183950894, 943.8817688019976),
+    "cmu/02_02.amc": (1242.2431386809078, 854.0687908839973),
+    "deepmimic/humanoid3d_jog.txt": (471.4796520891182, 278.449821449562),
+    "deepmimic/humanoid3d_long_walk1.txt": (16101.694808404034, 11347.763163233052),
+    "deepmimic/humanoid3d_long_walk2.txt": (11932.334014355736, 8023.953734198082),
+    "deepmimic/humanoid3d_long_walk3.txt": (7900.431545348334, 5595.244494448394),
+    "deepmimic/humanoid3d_walk.txt": (543.1070110008759, 373.1287434898468),
+    "sfu/0005_Walking001.bvh": (18959.64568539211, 13521.409118834332),
+    "sfu/0005_Walking001_retargeted_deepmimic_60hz.txt": (19048.114385077628, 13613.880851379894),
+}
+"""Sum of the absolute values of all states of the humanoid and of the biped, as first imported."""
+
+
+@pytest.mark.parametrize("file", NUMBERS)
+def test_real_files_are_imported_to_the_numbers_that_they_had_without_an_assumption(mocap, file):
+    for character, expected in zip(("humanoid", "biped"), NUMBERS[file], strict=True):
+        found = imported(mocap / file, character)
+        assert float(found.clip.qpos.abs().sum()) == pytest.approx(expected, rel=1e-10)
+        assert found.assumed == ""
+        assert found.cut.max() < 8
 
 
 SFU_NAMES = {"hip": "UpLeg", "knee": "Leg", "ankle": "Foot"}

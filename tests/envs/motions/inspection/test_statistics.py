@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrl_mcp.envs.characters.joints import character_model
-from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.inspection.signals import unwrapped
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics, speed_and_turn_rate
@@ -131,7 +131,7 @@ PUBLISHED = {
 
 def test_recorded_walking_measures_as_published(mocap):
     names = ("humanoid3d_long_walk1.txt", "humanoid3d_long_walk2.txt", "humanoid3d_long_walk3.txt")
-    clips = [read_deepmimic(mocap / "deepmimic" / name, "humanoid", rate=60.0) for name in names]
+    clips = [import_motion(mocap / "deepmimic" / name, "humanoid", rate=60.0) for name in names]
     strides = GaitStatistics(*(torch.cat(fields) for fields in zip(*map(gait_statistics, clips), strict=True)))
     straight = (strides.turn_rate.abs() < 0.35) & (strides.speed > 0.85) & (strides.speed < 1.35)
     medians = strides.select(straight).medians()

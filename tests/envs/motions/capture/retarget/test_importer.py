@@ -1,5 +1,6 @@
 """Importing a file: its rate and which frames, and what of files and options is refused."""
 
+import math
 from contextlib import suppress
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_mcp.envs.motions.capture.importer import import_motion
+from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.motions.capture.importer import import_motion, imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 
@@ -63,6 +65,39 @@ def test_the_clip_has_the_rate_asked_for(load, hinge, about):
 
 def test_the_frame_rate_of_the_user_wins(load):
     assert load([{}] * 11, fps=60.0, options={"fps": 10.0}).duration == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("time", ["0", "33.3", "-1", "nan", "thirty"])
+def test_the_frame_rate_of_the_user_wins_over_a_frame_time_that_is_none(bvh, tmp_path, time):
+    path = tmp_path / "motion.bvh"
+    path.write_text(bvh([{}] * 11).replace(f"Frame Time: {1 / 30!r}", f"Frame Time: {time}"))
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh:\d+: .*"):
+        import_motion(path, "humanoid")
+    assert import_motion(path, "humanoid", fps=10.0).duration == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0, 120.0, 240.0])
+def test_a_motion_lasts_as_long_at_any_frame_rate(load, hinge, about, fps):
+    poses = [{"LeftLeg": about([1, 0, 0], 60 * frame / fps)} for frame in range(round(fps) + 1)]
+    clip = load(poses, fps=fps)
+    np.testing.assert_allclose(hinge(clip, "left_knee"), -np.radians(np.linspace(0, 60, 31)), atol=1e-6)
+
+
+NECK = math.degrees(character_model("humanoid").joint("neck").range[1])
+"""Angle up to which the head can turn."""
+
+
+def test_a_head_turned_too_far_in_most_frames_is_refused_with_their_share(load, about):
+    poses = [{"Head": about([0, 1, 0], NECK + 50 if frame < 7 else 0)} for frame in range(10)]
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh: in 70 % of its frames .* 30 degrees, and by up to 50: "):
+        load(poses, fps=1.0)
+
+
+def test_what_limits_cut_is_measured_in_each_frame(bvh, tmp_path, about):
+    path = tmp_path / "motion.bvh"
+    beyond = [-20, 8, 0, 25, 40]
+    path.write_text(bvh([{"Head": about([0, 1, 0], NECK + degrees)} for degrees in beyond], fps=2.0))
+    np.testing.assert_allclose(imported(path, "humanoid").cut, [0, 8, 0, 25, 40], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["motion.fbx", "motion", "motion.asf"])
