@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_mcp.envs.characters import CHARACTERS as REGISTERED
+from torchrl_mcp.envs.characters import Character
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions import trex_corpus
 from torchrl_mcp.envs.motions.capture.importer import import_motion, imported
@@ -108,6 +110,28 @@ def test_archives_of_states_or_of_root_and_joints_come_back(clips, tmp_path, cha
     parts = {"root_pos": qpos[:, :3], "root_rot": qpos[:, 3:7], "dof_pos": qpos[:, 7:]}
     np.savez(path, **parts, fps=np.array([clip.fps]), joint_names=np.array(clip.layout.names[1:]))
     assert_same(import_motion(path, character, rate=clip.fps, quaternion="xyzw"), clip)
+
+
+WHEELS = """<mujoco model="cart"><worldbody><body name="cart" pos="0 0 1"><freejoint name="root"/>
+<geom type="box" size=".3 .2 .1"/>
+<body name="left_wheel" pos="0 .3 -.5"><joint name="left_axle" axis="0 1 0"/><geom type="sphere" size=".5"/></body>
+<body name="right_wheel" pos="0 -.3 -.5"><joint name="right_axle" axis="0 1 0"/><geom type="sphere" size=".5"/></body>
+</body></worldbody></mujoco>"""
+
+
+def test_a_character_of_your_own_needs_no_limits_of_its_joints(tmp_path, monkeypatch):
+    (tmp_path / "cart.xml").write_text(WHEELS)
+    cart = Character(
+        "cart", feet=("left_wheel", "right_wheel"), key_bodies=(), carrier="cart", file=tmp_path / "cart.xml"
+    )
+    monkeypatch.setitem(REGISTERED, "cart", cart)
+    angles = np.linspace(0, 50, 11)
+    rows = [[0.1 * index, 0, 1, 1, 0, 0, 0, angle, -angle] for index, angle in enumerate(angles)]
+    (tmp_path / "motion.csv").write_text(table(rows, ["x", "y", "z", "w", "i", "j", "k", "right_axle", "left_axle"]))
+    found = imported(tmp_path / "motion.csv", "cart", fps=10.0, rate=10.0)
+    np.testing.assert_allclose(found.clip.qpos[:, 7:], np.stack([-angles, angles], axis=1), atol=1e-9)
+    np.testing.assert_allclose(found.clip.qpos[:, 2], 1.0)
+    assert not found.cut.any()
 
 
 def test_the_frame_rate_of_the_user_wins(clips, tmp_path):
