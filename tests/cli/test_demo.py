@@ -18,7 +18,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from torchrl_mcp.cli import demo as command
-from torchrl_mcp.cli import demonstration as demo
+from torchrl_mcp.commands import demo
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import builtin
 

@@ -4,7 +4,7 @@ import pytest
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
-from torchrl_mcp.cli import training
+from torchrl_mcp.commands import train
 from torchrl_mcp.runs import experiment
 
 
@@ -21,7 +21,7 @@ def said(cfg, monkeypatch, failure):
 
     monkeypatch.setattr(experiment, "train", fail)
     with pytest.raises(SystemExit) as stop:
-        training.train(cfg)
+        train.train(cfg)
     assert stop.value.code not in (0, 1)
     return str(stop.value.code)
 

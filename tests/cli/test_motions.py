@@ -8,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchrl_mcp.cli import motion_files, motions
+from torchrl_mcp.cli import motions
+from torchrl_mcp.commands import motions as motion_files
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk

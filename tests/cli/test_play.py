@@ -3,7 +3,8 @@ import sys
 import pytest
 from PIL import Image
 
-from torchrl_mcp.cli import play, playing
+from torchrl_mcp.cli import play
+from torchrl_mcp.commands import play as playing
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.rendering import opengl
 

@@ -11,7 +11,8 @@ import torch
 from hydra import compose, initialize_config_module
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.cli import evaluate, play, publish, publishing
+from torchrl_mcp.cli import evaluate, play, publish
+from torchrl_mcp.commands import publish as publishing
 from torchrl_mcp.evaluation import rollout
 from torchrl_mcp.runs import builtin, experiment, policies
 from torchrl_mcp.runs.publish import publish as write_published

@@ -8,8 +8,8 @@ from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 
 import torchrl_mcp.conf
-from torchrl_mcp.cli.suggestions import suggestions
 from torchrl_mcp.cli.train import main
+from torchrl_mcp.commands.suggestions import suggestions
 from torchrl_mcp.runs import benchmark
 
 CONF = Path(torchrl_mcp.conf.__file__).parent

@@ -21,7 +21,7 @@ def test_what_may_be_built_is_what_the_files_of_the_library_name():
     lines = [line for path in Path(conf.__file__).parent.rglob("*.yaml") for line in path.read_text().splitlines()]
     named = {name for line in lines for name in re.findall(r"_target_: ([\w.]+)", line)}
     classes = {name for line in lines for name in re.findall(rf"{GET_CLASS}, path: ([\w.]+)", line)}
-    assert known() == (named | classes) - {"torchrl_mcp.cli.sweep.Sweep"}  # of Hydra, which no run has
+    assert known() == (named | classes) - {"torchrl_mcp.commands.sweep.Sweep"}  # of Hydra, which no run has
     assert {"torch.optim.Adam", "torchrl_mcp.envs.Heading", "torch.nn.Sigmoid"} < known()
 
 

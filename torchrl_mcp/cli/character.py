@@ -5,7 +5,8 @@ import re
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, interruptible, new_parser
+from torchrl_mcp.cli.parsing import interruptible, new_parser
+from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-character"
 
@@ -23,10 +24,10 @@ def main() -> None:
     if not arguments.file.is_file():
         sys.exit(f"{PROGRAM}: there is no file {arguments.file}")
     announce(PROGRAM)
-    from torchrl_mcp.cli import own_character
+    from torchrl_mcp.commands import character
 
     try:
-        sys.exit(getattr(own_character, arguments.run)(arguments))
+        sys.exit(getattr(character, arguments.run)(arguments))
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
 

@@ -4,7 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, new_parser
+from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-demo"
 
@@ -15,7 +16,7 @@ def main() -> None:
     announce(PROGRAM)
     from hydra.errors import HydraException
 
-    from torchrl_mcp.cli.demonstration import run
+    from torchrl_mcp.commands.demo import run
 
     preset = "demo_smoke" if arguments.smoke else "demo"
     output = arguments.output or Path("runs", "demo-pretrain" if arguments.pretrain else "demo")

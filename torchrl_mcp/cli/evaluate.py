@@ -10,7 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, announce, interruptible, new_parser, task_settings
+from torchrl_mcp.cli.parsing import add_task, add_trust, interruptible, new_parser
+from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
 
@@ -24,6 +25,7 @@ def main() -> None:
     try:
         path = locate(arguments.checkpoint)
         announce(PROGRAM)
+        from torchrl_mcp.commands.task_settings import task_settings
         from torchrl_mcp.runs.policies import evaluate_clips, evaluation
         from torchrl_mcp.runs.trust import trusting
 

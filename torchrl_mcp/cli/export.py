@@ -4,7 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 
 PROGRAM = "torchrl-mcp-export"

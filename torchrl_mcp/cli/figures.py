@@ -4,7 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
 PROGRAM = "torchrl-mcp-figures"
@@ -28,11 +29,11 @@ def main() -> None:
     try:
         arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
         announce(PROGRAM)
-        from torchrl_mcp.cli import paper_figures
+        from torchrl_mcp.commands import figures
         from torchrl_mcp.runs.trust import trusting
 
         with trusting(arguments.trust):
-            getattr(paper_figures, arguments.draw)(arguments)
+            getattr(figures, arguments.draw)(arguments)
     except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
 

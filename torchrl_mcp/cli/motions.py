@@ -30,9 +30,9 @@ def main() -> None:
     arguments = parser().parse_args()
     try:
         require_files(arguments)
-        from torchrl_mcp.cli import motion_files
+        from torchrl_mcp.commands import motions
 
-        getattr(motion_files, arguments.run)(arguments)
+        getattr(motions, arguments.run)(arguments)
     except (BadZipFile, OSError, RuntimeError, ValueError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         sys.exit(2)

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from functools import wraps
 from importlib.resources import files
-from typing import Any, cast
+from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
@@ -95,15 +95,6 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"arguments of the tasks (--task):\n{listed}\n\n{parser.epilog or ''}"
 
 
-def task_settings(words: list[str]) -> dict[str, Any]:
-    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
-    from omegaconf import OmegaConf
-
-    if lost := [word for word in words if "=" not in word]:
-        raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
-    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
-
-
 def _task_arguments() -> Iterator[tuple[str, list[str]]]:
     """Yield each task with its arguments, from its evaluation in ``conf/task``."""
     conf = files("torchrl_mcp.conf")
@@ -116,8 +107,3 @@ def _task_arguments() -> Iterator[tuple[str, list[str]]]:
         shared = [entry[1:].partition("@")[0] for entry in content["defaults"] if str(entry).startswith("/")]
         parts = [content.get("task", content), *map(settings, shared)]
         yield name, sorted(argument for part in parts for argument in part["evaluation"])
-
-
-def announce(program: str) -> None:
-    """Print that a command is importing its libraries, which takes seconds without other output."""
-    print(f"{program} {__version__}: loading PyTorch and MuJoCo ...", file=sys.stderr, flush=True)

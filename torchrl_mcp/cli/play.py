@@ -4,9 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, announce, find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_task, add_trust, find_own_modules, new_parser
+from torchrl_mcp.commands import announce
+from torchrl_mcp.evaluation.formats import require_format
 from torchrl_mcp.runs.builtin import locate
-from torchrl_mcp.viewer.formats import require_format
 
 PROGRAM = "torchrl-mcp-play"
 
@@ -32,7 +33,7 @@ def main() -> None:
         if arguments.viewer is None:
             require_format(arguments.output)
         announce(PROGRAM)
-        from torchrl_mcp.cli.playing import play
+        from torchrl_mcp.commands.play import play
         from torchrl_mcp.runs.trust import trusting
 
         with trusting(arguments.trust):

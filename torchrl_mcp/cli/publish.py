@@ -4,7 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, announce, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-publish"
 
@@ -27,7 +28,7 @@ def main() -> None:
         if not arguments.run.is_dir():
             raise ValueError(f"there is no run folder {arguments.run}")
         announce(PROGRAM)
-        from torchrl_mcp.cli.publishing import publish
+        from torchrl_mcp.commands.publish import publish
         from torchrl_mcp.runs.trust import trusting
 
         with trusting(arguments.trust):

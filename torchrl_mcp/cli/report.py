@@ -6,7 +6,8 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import announce, interruptible, new_parser
+from torchrl_mcp.cli.parsing import interruptible, new_parser
+from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-report"
 

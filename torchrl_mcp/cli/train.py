@@ -46,8 +46,8 @@ def main() -> None:
         parser().parse_args(sorted(own))
     from hydra.errors import HydraException
 
-    from torchrl_mcp.cli.suggestions import answer
-    from torchrl_mcp.cli.training import run, run_benchmark
+    from torchrl_mcp.commands.suggestions import answer
+    from torchrl_mcp.commands.train import run, run_benchmark
     from torchrl_mcp.runs.trust import trusting
 
     if any(word.startswith(("-cd", "--config-dir")) for word in words):

@@ -30,7 +30,7 @@ from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
-from torchrl_mcp.runs import places, settings
+from torchrl_mcp.runs import places, validation
 from torchrl_mcp.runs.trust import require_trusted, targets
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
@@ -59,13 +59,13 @@ def require_valid(cfg: DictConfig) -> None:
     """Check the values of all settings.
 
     Raises:
-        ValueError: As :func:`torchrl_mcp.runs.settings.require_valid`, or if a setting refers to one that is missing.
+        ValueError: As :func:`torchrl_mcp.runs.validation.require_valid`, or if a setting refers to one that is missing.
     """
     try:
         config = _plain(cfg)
     except OmegaConfBaseException as error:
         raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
-    settings.require_valid(config)
+    validation.require_valid(config)
 
 
 def require_environment(cfg: DictConfig) -> None:

@@ -195,7 +195,7 @@ class Trainer:
         minibatches = [index for order in orders for index in order.split(self.minibatch_size)]
         learning = {name: partial(self._learn, name, samples, minibatches) for name in self.optimizers}
         if warming_up and "actor" in learning:
-            learning["actor"] = partial(self._wait, samples[minibatches[0]])
+            learning["actor"] = partial(self._report_without_learning, samples[minibatches[0]])
         # Actor and critic share only the samples: on a CPU they learn in parallel.
         reports = side_by_side(learning) if self.device.type == "cpu" else {name: f() for name, f in learning.items()}
         metrics = {f"loss/{key}": value for report in reports.values() for key, value in _mean(report).items()}
@@ -208,9 +208,9 @@ class Trainer:
             self.schedule.step(metrics["loss/kl"])
         if "actor" in self.optimizers:
             metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
-        return metrics | self._networks(samples[: self.minibatch_size])
+        return metrics | self._network_metrics(samples[: self.minibatch_size])
 
-    def _networks(self, samples: TensorDictBase) -> dict[str, float]:
+    def _network_metrics(self, samples: TensorDictBase) -> dict[str, float]:
         """Return metrics of exploration and of dead units, from samples ``(B,)``."""
         metrics: dict[str, float] = {}
 
@@ -232,7 +232,7 @@ class Trainer:
         return reports
 
     @torch.no_grad()
-    def _wait(self, samples: TensorDictBase) -> list[TensorDictBase]:
+    def _report_without_learning(self, samples: TensorDictBase) -> list[TensorDictBase]:
         """Return the outputs of the actor's loss with log-probabilities under the current normalisers."""
         with self._precision():
             distribution = self.actor.trained.get_dist(samples)

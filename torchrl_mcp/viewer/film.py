@@ -15,9 +15,9 @@ from torchrl_mcp.analysis.figures import INK
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.rendering.camera import Camera, save_gif
 from torchrl_mcp.evaluation.bars import bar
+from torchrl_mcp.evaluation.formats import ENCODER, EVERY, require_format
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.viewer.bars import draw_bars
-from torchrl_mcp.viewer.formats import ENCODER, EVERY, require_format
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.scenery import softly_lit
 
@@ -107,7 +107,7 @@ def save_film(
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
-        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.viewer.formats.require_format`.
+        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.evaluation.formats.require_format`.
     """
     player = Player(policy, env, deterministic=deterministic, num_options=num_options, aside=aside)
     save_films({"": player}, path, seconds=seconds, width=width, height=height)
@@ -125,7 +125,7 @@ def save_films(players: Mapping[str, Player], path: Path, *, seconds: float, wid
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
-        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.viewer.formats.require_format`.
+        ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.evaluation.formats.require_format`.
     """
     require_format(path)
     save, every = {".gif": save_gif, ".mp4": save_mp4}[path.suffix], EVERY[path.suffix]

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.capture.build import LONGEST, NO_ROTATION, TOP_SPEED, JointMotion, speeds
+from torchrl_mcp.envs.motions.capture.joint_motion import LONGEST, NO_ROTATION, TOP_SPEED, JointMotion, speeds
 from torchrl_mcp.envs.motions.capture.skeleton import frame_rate
 from torchrl_mcp.envs.motions.capture.textfile import LARGEST_NUMBER, TextFile, shortened
 from torchrl_mcp.envs.rotations import from_rotation_vector, inverse, multiply, to_rotation_vector

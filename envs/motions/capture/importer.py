@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
-from torchrl_mcp.envs.motions.capture.build import QUATERNIONS, assembled, require_human
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
+from torchrl_mcp.envs.motions.capture.joint_motion import QUATERNIONS, assembled, require_human
 from torchrl_mcp.envs.motions.capture.qpos import read_qpos
 from torchrl_mcp.envs.motions.capture.retarget import retarget
 from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.archive import Archive
-from torchrl_mcp.envs.motions.capture.build import (
+from torchrl_mcp.envs.motions.capture.joint_motion import (
     LONGEST,
     NO_ROTATION,
     QUATERNIONS,

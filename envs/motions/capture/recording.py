@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, LEG, bones, find_joints
-from torchrl_mcp.envs.motions.capture.build import LONGEST, TOP_SPEED, speeds
+from torchrl_mcp.envs.motions.capture.joint_motion import LONGEST, TOP_SPEED, speeds
 from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
 from torchrl_mcp.envs.motions.capture.upright import upright
 from torchrl_mcp.envs.rotations import inverse, multiply

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, SIDES, TRUNK, limb
-from torchrl_mcp.envs.motions.capture.build import JointMotion, require_human, speeds
+from torchrl_mcp.envs.motions.capture.joint_motion import JointMotion, require_human, speeds
 from torchrl_mcp.envs.motions.capture.recording import Recording, record
 from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
 from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate, shortest

@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchrl_mcp import __version__, analysis
-from torchrl_mcp.cli.demonstration_page import write_page
+from torchrl_mcp.commands.demo_page import write_page
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
 from torchrl_mcp.runs import build, experiment
-from torchrl_mcp.runs.settings import RULES
+from torchrl_mcp.runs.validation import RULES
 
 METHODS = sorted(path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml"))
 PLACES = [(method, "heading") for method in METHODS] + [

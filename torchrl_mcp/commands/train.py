@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from torchrl_mcp.cli.parsing import announce
+from torchrl_mcp.commands import announce
 from torchrl_mcp.runs import places, quoting
 from torchrl_mcp.runs.trust import resuming
 from torchrl_mcp.training.run_folder import CONFIG
@@ -52,7 +52,7 @@ def train(cfg: DictConfig) -> float | None:
     announce(PROGRAM)
     in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     with _interruptible() if in_sweep else _explained(cfg):
-        from torchrl_mcp.cli.summary import final_return, summary
+        from torchrl_mcp.commands.summary import final_return, summary
         from torchrl_mcp.runs import experiment
 
         begin = experiment.train_or_resume if in_sweep else experiment.train

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.archive import Archive
-from torchrl_mcp.envs.motions.capture.build import HUMANS
 from torchrl_mcp.envs.motions.capture.importer import Import, imported
+from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics

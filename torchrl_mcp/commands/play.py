@@ -9,7 +9,7 @@ import torch
 from hydra.errors import HydraException
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
-from torchrl_mcp.cli.parsing import task_settings
+from torchrl_mcp.commands.task_settings import task_settings
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv

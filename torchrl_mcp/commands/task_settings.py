@@ -1,0 +1,12 @@
+"""The settings that ``--task`` gives."""
+
+from typing import Any, cast
+
+from omegaconf import OmegaConf
+
+
+def task_settings(words: list[str]) -> dict[str, Any]:
+    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
+    if lost := [word for word in words if "=" not in word]:
+        raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
+    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
