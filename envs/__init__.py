@@ -13,6 +13,16 @@ import tensordict  # noqa: F401
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.tasks import Carry, Dribble, Heading, Holdout, Imitation
+from torchrl_mcp.envs.tasks import Carry, Dribble, Heading, Holdout, Imitation, Location
 
-__all__ = ["Carry", "CharacterEnv", "Curriculum", "Dribble", "Heading", "Holdout", "Imitation", "PDCharacterEnv"]
+__all__ = [
+    "Carry",
+    "CharacterEnv",
+    "Curriculum",
+    "Dribble",
+    "Heading",
+    "Holdout",
+    "Imitation",
+    "Location",
+    "PDCharacterEnv",
+]

@@ -21,6 +21,7 @@ TASKS = {  # characters that can do it, the one it takes by default, and its sta
     "heading": (WALKERS, "biped", {"transfer"}),
     "holdout": ({"ant"}, "ant", {"pretrain", "transfer"}),
     "imitation": (WALKERS, "biped", {"pretrain"}),
+    "location": (WALKERS, "biped", {"transfer"}),
 }
 
 

@@ -5,5 +5,6 @@ from torchrl_mcp.envs.tasks.dribble import Dribble
 from torchrl_mcp.envs.tasks.heading import Heading
 from torchrl_mcp.envs.tasks.holdout import Holdout
 from torchrl_mcp.envs.tasks.imitation import Imitation
+from torchrl_mcp.envs.tasks.location import Location
 
-__all__ = ["Carry", "Dribble", "Heading", "Holdout", "Imitation"]
+__all__ = ["Carry", "Dribble", "Heading", "Holdout", "Imitation", "Location"]

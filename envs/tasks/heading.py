@@ -1,4 +1,4 @@
-"""The heading task: walk in a direction that keeps changing."""
+"""The heading task: walk in a direction that keeps changing, also at changing speeds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,14 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative, positive
+from torchrl_mcp.envs.arguments import interval, not_negative, positive
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.ranges import Ranges
-from torchrl_mcp.envs.tasks.rewards import heading_reward
+from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 
 
 class Heading(PDCharacterEnv):
@@ -24,11 +24,15 @@ class Heading(PDCharacterEnv):
     ``goal`` (2) is the unit vector of the target direction in the character's heading frame. The reward of a step
     uses the direction that the action could see.
 
+    With a range of speeds, another speed is drawn now and then, ``goal`` (3) ends with the speed in m/s, and motion
+    across the direction counts too, see :func:`~torchrl_mcp.envs.tasks.rewards.velocity_reward`.
+
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_turn: Largest change :math:`\delta` of the direction per step, in radians. Paper: 0.15.
-        speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
+        speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin with 0. Paper: 1.
+        speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for none.
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
             faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
@@ -53,19 +57,23 @@ class Heading(PDCharacterEnv):
         num_envs: int,
         *,
         max_turn: float = 0.15,
-        speed: float = 1.0,
+        speed: float | Sequence[float] = 1.0,
+        speed_interval: float = 3.0,
         initial_directions: Sequence[float] = (0.0, 0.0),
         max_episode_steps: int = 600,
         **kwargs: Any,
     ) -> None:
         not_negative(max_turn=max_turn)
-        positive(speed=speed)
-        self.max_turn, self.speed = max_turn, speed
+        if not speed_interval > 0:
+            raise ValueError(f"speed_interval={speed_interval} is out of range: pass seconds, or inf for no changes")
+        self.max_turn, self.speeds = max_turn, _speeds(speed)
+        self.change_probability = CONTROL_TIMESTEP / speed_interval
+        zero = torch.zeros((), dtype=torch.float64)
         super().__init__(
             character,
             num_envs,
             max_episode_steps=max_episode_steps,
-            episode={"direction": torch.zeros((), dtype=torch.float64)},
+            episode={"direction": zero, "speed": zero + self.speeds[1]},
             **kwargs,
         )
         self.initial_states = InitialStates(
@@ -74,42 +82,77 @@ class Heading(PDCharacterEnv):
         self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
         self.make_specs()
 
+    @property
+    def changes_speed(self) -> bool:
+        """Whether the speed has a range, and changes."""
+        return self.speeds[0] < self.speeds[1]
+
     def initial_state(self, num: int) -> dict[str, Tensor]:
-        """The character, and a direction."""
+        """The character, a direction, and in a range of speeds one of them."""
         direction = self.ranges.draw(num, self.generator)["initial_directions"]
-        return {**self.initial_states.fill(super().initial_state(num), self.generator), "direction": direction}
+        start = {**self.initial_states.fill(super().initial_state(num), self.generator), "direction": direction}
+        return {**start, "speed": self._uniform(num, *self.speeds)} if self.changes_speed else start
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
-        """State of the character, and the target direction as it sees it."""
+        """State of the character, the target direction as it sees it, and the speed if it changes."""
         goal = unit_vector(self.episode["direction"][ids] - self.heading(ids))
+        if self.changes_speed:
+            goal = torch.cat([goal, self.episode["speed"][ids].unsqueeze(-1)], -1)
         return {"observation": self.see(ids)[0], "goal": goal}
 
     def reward(self) -> Tensor:
-        """Reward of appendix D."""
-        return heading_reward(self.velocity("com")[:, :2], unit_vector(self.episode["direction"]), self.speed)
+        """Reward of appendix D; with a range of speeds, its form for a velocity."""
+        return self._reward_of(self.velocity("com")[:, :2])
 
     def update_goal(self) -> None:
-        """Let the direction wander."""
-        direction = self.episode["direction"]
-        direction += torch.empty_like(direction).uniform_(-self.max_turn, self.max_turn, generator=self.generator)
+        """Let the direction wander, and change some of the speeds."""
+        self.episode["direction"] += self._uniform(self.num_envs, -self.max_turn, self.max_turn)
+        if self.changes_speed:
+            speed, another = self.episode["speed"], self._uniform(self.num_envs, *self.speeds)
+            changes = self._uniform(self.num_envs, 0.0, 1.0) < self.change_probability
+            speed.copy_(torch.where(changes, another, speed))
 
-    def reach(self) -> Reach:
-        """See :meth:`CharacterEnv.reach`: the ideal player walks at the target speed from the first step on."""
-        still = torch.zeros(self.num_envs, 2, dtype=torch.float64, device=self.device)
-        standing = heading_reward(still, unit_vector(self.episode["direction"]), self.speed)
+    def reach(self) -> Reach | None:
+        """See :meth:`CharacterEnv.reach`; None with a range of speeds, which are drawn as the episode goes on.
+
+        The ideal player walks at the target speed from the first step on.
+        """
+        if self.changes_speed:
+            return None
+        standing = self._reward_of(torch.zeros(self.num_envs, 2, dtype=torch.float64, device=self.device))
         return Reach(self.max_episode_steps * standing, torch.full_like(standing, self.max_episode_steps))
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return mirror_signs(VECTOR_SIGNS)
+        return mirror_signs([*VECTOR_SIGNS, 1] if self.changes_speed else VECTOR_SIGNS)
 
     def arrows(self, index: int) -> list[Arrow]:
-        """See :meth:`CharacterEnv.arrows`: an arrow in the target direction."""
+        """See :meth:`CharacterEnv.arrows`: an arrow in the target direction, of the speed's length in a second."""
         tail = self.com[index].cpu() + torch.tensor([0.0, 0.0, 0.8])
-        tip = tail + torch.nn.functional.pad(unit_vector(self.episode["direction"][index].cpu()), (0, 1))
-        return [(tail.double().numpy(), tip.numpy())]
+        way = unit_vector(self.episode["direction"][index].cpu()) * self.episode["speed"][index].cpu()
+        return [(tail.double().numpy(), (tail + torch.nn.functional.pad(way, (0, 1))).numpy())]
+
+    def _uniform(self, num: int, low: float, high: float) -> Tensor:
+        """Draw numbers between two bounds, ``(num,)``, float64."""
+        numbers = torch.empty(num, dtype=torch.float64, device=self.device)
+        return numbers.uniform_(low, high, generator=self.generator)
+
+    def _reward_of(self, velocity: Tensor) -> Tensor:
+        """Reward of a velocity of the centre of mass ``(N, 2)`` with the current goals, ``(N,)``."""
+        direction = unit_vector(self.episode["direction"])
+        if self.changes_speed:
+            return velocity_reward(velocity, direction * self.episode["speed"].unsqueeze(-1))
+        return heading_reward(velocity, direction, self.speeds[0])
 
 
 def unit_vector(angle: Tensor) -> Tensor:
     """(cos, sin) of an angle in radians, shape ``(*B, 2)``."""
     return torch.stack([angle.cos(), angle.sin()], -1)
+
+
+def _speeds(speed: float | Sequence[float]) -> tuple[float, float]:
+    """Bounds of a range of speeds, which are equal for a single one."""
+    low, high = (speed, speed) if isinstance(speed, int | float) else interval("speed", speed)
+    not_negative(speed=low)
+    positive(speed=high)
+    return low, high

@@ -66,6 +66,10 @@ class Ranges:
                 if low < 0:
                     raise ValueError(f"{name}={(low, high)} begins below 0: pass two distances (lo, hi) in metres")
 
+    def lowest(self, name: str) -> float:
+        """Return the lowest number that may be drawn for a name, over all alternatives."""
+        return float(self._of(name)[:, 0].min())
+
     def keep_clear(self, name: str, clearance: float) -> None:
         """Raise the lower bounds of distances to ``clearance`` metres, below which bodies would overlap.
 

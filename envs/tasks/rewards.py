@@ -7,8 +7,11 @@ from functools import cache
 import torch
 from torch import Tensor
 
+ARRIVAL_DISTANCE = 0.3
+"""Distance in metres from a place at which a character has arrived, and should stand."""
 
-def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
+
+def heading_reward(velocity: Tensor, direction: Tensor, speed: Tensor | float) -> Tensor:
     r"""Reward of the heading task: walk in a target direction at a target speed.
 
     .. math:: r = \exp(-4 (\hat{u} \cdot v_{com} - \hat{v})^2)
@@ -18,7 +21,7 @@ def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
         direction: Target direction :math:`\hat{u}`, a unit vector, shape ``(*B, 2)``. The paper writes
             :math:`(\cos\hat{\theta}, -\sin\hat{\theta})` for a world whose y axis points up; here the z axis does, and
             :math:`\hat{u} = (\cos\hat{\theta}, \sin\hat{\theta})`.
-        speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
+        speed: Target speed :math:`\hat{v}`, in m/s, shape ``(*B)`` or a number. Paper: 1.
 
     Returns:
         Reward, shape ``(*B)``.
@@ -28,6 +31,55 @@ def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
         appendix D, https://arxiv.org/abs/1905.09808
     """
     return (-4 * ((direction * velocity).sum(-1) - speed).square()).exp()
+
+
+def velocity_reward(velocity: Tensor, target: Tensor) -> Tensor:
+    r"""Reward of moving at a target velocity: the heading task's, which also counts motion across the direction.
+
+    .. math:: r = \exp(-4 \|v_{com} - v^*\|^2)
+
+    With a speed of 0, :func:`heading_reward` is as high for a character that walks across the direction as for one that
+    stands.
+
+    Args:
+        velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
+        target: Target velocity :math:`v^*`, shape ``(*B, 2)``, in m/s.
+
+    Returns:
+        Reward, shape ``(*B)``.
+    """
+    return (-4 * (velocity - target).square().sum(-1)).exp()
+
+
+def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: Tensor | float = 1.0) -> Tensor:
+    r"""Reward of the location task: go to a place, and stand there.
+
+    .. math::
+        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 e) \\
+        e &= \begin{cases}
+            \|v_{com}\|^2 & \|x\| < 0.3 \text{ m} \\
+            (\hat{u} \cdot v_{com} - \min(\|x\| / 1 \text{ s}, \hat{v}))^2 & \text{else} \end{cases}
+
+    On the way, the second term is the paper's heading reward with the direction to the place :math:`\hat{u} = x / \|x\|`:
+    it guides the character from any distance, slows it over the last metre, and at the place asks it to stand. The first
+    term, which is flat far away, is for the last half metre. It has the direction to face as a factor, which hence
+    matters only at the place.
+
+    Args:
+        velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
+        offset: The place relative to the centre of mass :math:`x`, shape ``(*B, 2)``, in metres.
+        speed: Speed far from the place :math:`\hat{v}`, in m/s.
+        alignment: Cosine :math:`c` of the angle between the character's heading and the direction to face at the place,
+            shape ``(*B)``; 1 if it may face any direction.
+
+    Returns:
+        Reward, shape ``(*B)``.
+    """
+    distance = torch.linalg.vector_norm(offset, dim=-1)
+    approach = heading_reward(velocity, torch.nn.functional.normalize(offset, dim=-1), distance.clamp(max=speed))
+    stand = velocity_reward(velocity, torch.zeros_like(velocity))
+    at_place = (-distance.square()).exp() * (1 + alignment) / 2
+    return 0.4 * at_place + 0.6 * torch.where(distance < ARRIVAL_DISTANCE, stand, approach)
 
 
 def holdout_reward(

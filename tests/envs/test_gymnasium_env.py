@@ -17,7 +17,7 @@ NAMES = sorted(name for name in gymnasium.registry if name.startswith("torchrl_m
 
 
 def test_every_task_is_registered_with_every_character():
-    tasks = ("Carry", "Dribble", "Heading", "Imitation")
+    tasks = ("Carry", "Dribble", "Heading", "Imitation", "Location")
     pairs = [(task, character) for task in tasks for character in CHARACTERS] + [("Holdout", "ant")]
     assert sorted(f"torchrl_mcp/{task}-{character.capitalize()}-v0" for task, character in pairs) == NAMES
 

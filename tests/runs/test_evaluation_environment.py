@@ -12,6 +12,7 @@ STAGES = {
     "holdout": "pretrain",
     "imitation": "pretrain",
     "heading": "transfer",
+    "location": "transfer",
     "carry": "transfer",
     "dribble": "transfer",
 }
@@ -32,6 +33,8 @@ NO_SETTINGS = {
 """Arguments that every maker of an environment gives, or that say what is in it and not what happens."""
 RUNS_OWN = {
     "imitation": {"terms", "switch_to"},
+    "heading": {"speed"},
+    "location": {"final_directions"},
     "carry": {"goal_positions"},
     "dribble": {"goal_positions"},
 }
@@ -51,9 +54,11 @@ OTHER = {
     "object_directions": [0.5, 0.6],
     "target_distances": [1.0, 2.0],
     "target_directions": [0.5, 0.6],
+    "target_intervals": [0.1, 0.2],
     "goal_positions": "metres",
     "max_turn": 0.5,
     "speed": 2.0,
+    "speed_interval": 1.0,
     "target_distance_power": 1,
     "success_reward": True,
     "max_episode_steps": 7,
@@ -98,7 +103,7 @@ def trained_otherwise(task):
     cfg, place = configure(task), "imitation" if task == "imitation" else f"task.{STAGES[task]}"
     for name in evaluated_as(cfg).keys() - RUNS_OWN.get(task, set()):
         OmegaConf.update(cfg, f"{place}.{name}", OTHER[name], merge=False, force_add=True)
-    if task == "heading":  # whose reward has no terms to weigh
+    if task in ("heading", "location"):  # whose reward has no terms to weigh
         cfg.task.transfer.curriculum.reward_weights = None
     return cfg
 
@@ -154,12 +159,12 @@ def test_near_objects_of_training_are_clear_of_every_character(task, character):
 
 
 @pytest.mark.parametrize("curriculum", ["none", "mixed"])
-@pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
+@pytest.mark.parametrize("task", ["heading", "location", "carry", "dribble"])
 def test_every_curriculum_makes_environments_that_begin_and_are_evaluated_alike(task, curriculum):
     cfg = configure(task, f"curriculum={curriculum}")
     assert evaluated_as(cfg) == evaluated_as(configure(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
-    another = curriculum == "mixed" and task != "heading"
+    another = curriculum == "mixed" and task not in ("heading", "location")
     assert ("task_reward" in env.rollout(2)["next"]) == another
 
 

@@ -13,7 +13,7 @@ from torchrl_mcp.runs.validation import RULES
 
 METHODS = sorted(path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml"))
 PLACES = [(method, "heading") for method in METHODS] + [
-    ("mcp", task) for task in ("holdout", "imitation", "carry", "dribble")
+    ("mcp", task) for task in ("holdout", "imitation", "location", "carry", "dribble")
 ]
 
 

@@ -63,6 +63,11 @@ RANGE = Rule(
     lambda value: _is_list(value, _is_number) and len(value) == 2 and value[0] <= value[1],
 )
 
+SPEED = Rule(
+    "a finite number above 0, or a range [low, high] from at least 0",
+    lambda value: POSITIVE.allows(value) or (RANGE.allows(value) and value[0] >= 0),
+)
+
 NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
         num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor lengths.none lengths.mixed
@@ -74,10 +79,11 @@ NAMES_BY_RULE: dict[Rule, str] = {
     SEED: "seed",
     POSITIVE: """
         lr min_lr max_lr step_size.actor step_size.max step_size.critic target_kl clip_epsilon advantages.clip
-        action_std initial_std std logits_std scale speed max_error width kept_width
+        action_std initial_std std logits_std scale max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
-    PERIOD: "switch_interval",
+    PERIOD: "switch_interval speed_interval",
+    SPEED: "speed",
     NOT_NEGATIVE: """
         bound_coeff coeff kl_coeff termination_cost weight max_turn
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
@@ -93,10 +99,11 @@ NAMES_BY_RULE: dict[Rule, str] = {
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
-        object_directions target_distances target_directions
+        object_directions target_distances target_directions target_intervals
         evaluation.directions environment.directions directions.pretrain directions.transfer pretrain.directions
         transfer.directions
     """,
+    RANGE.or_null(): "final_directions",
     WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
     WEIGHTS.or_null(): "reward_weights",
     NAMES: "transfer.freeze transfer.keep",

@@ -1,10 +1,12 @@
 """Mirror images: of a transition, simulated with left and right exchanged, the maps know state, action and goal."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location
 from torchrl_mcp.envs.characters.joints import joint_layout
 from torchrl_mcp.envs.motions import MotionLibrary, trex_corpus, turning_clips
 
@@ -30,6 +32,12 @@ TASKS = {
     "heading": lambda character, **settings: Heading(
         character, initial_directions=(-3.0, 3.0), max_turn=0.0, **settings
     ),
+    "speeds": lambda character, **settings: Heading(
+        character, initial_directions=(-3.0, 3.0), max_turn=0.0, speed=(0.0, 1.5), speed_interval=math.inf, **settings
+    ),
+    "location": lambda character, **settings: Location(
+        character, target_intervals=(9.0, 9.0), final_directions=(-3.0, 3.0), **settings
+    ),
     "dribble": lambda character, **settings: Dribble(character, object_distances=(0.5, 1.0), **settings),
     "carry": lambda character, **settings: Carry(character, object_distances=(0.5, 1.0), **settings),
     "imitation": imitation,
@@ -51,10 +59,10 @@ def reflected(state, character, nv):
         image["qvel"][:, here] = qvel[:, there] * torch.tensor(signs)
     image["qpos"][:, layout.nq :] *= torch.tensor((PLACE + TURN)[: qpos.shape[1] - layout.nq])
     image["qvel"][:, layout.nv :] *= torch.tensor((PLACE + SPIN)[: nv - layout.nv])
-    for key, signs in {"mocap_pos": PLACE, "mocap_quat": TURN, "com": PLACE, "object": PLACE, "shift": [1, -1]}.items():
-        if key in image:
-            image[key] *= torch.tensor(signs)
-    for key in {"direction", "turn"} & image.keys():
+    signs = {"mocap_pos": PLACE, "mocap_quat": TURN, "com": PLACE, "object": PLACE, "shift": [1, -1], "target": [1, -1]}
+    for key in signs.keys() & image.keys():
+        image[key] *= torch.tensor(signs[key])
+    for key in {"direction", "final_direction", "turn"} & image.keys():
         image[key] *= -1
     if "clip" in image:
         image["clip"] = 1 - image["clip"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchrl_mcp.envs import Heading
-from torchrl_mcp.envs.tasks.rewards import heading_reward
+from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 
 
 def make(num_envs=64, **kwargs):
@@ -82,10 +82,82 @@ def test_the_best_possible_return_is_one_and_the_worst_zero():
 
 
 @pytest.mark.parametrize(
+    ("velocity", "target", "reward"),
+    [
+        ((0.6, 0.8), (0.6, 0.8), 1.0),
+        ((0.0, 0.0), (0.0, 0.0), 1.0),
+        ((0.0, 0.5), (0.0, 0.0), math.exp(-1)),  # who is to stand must not walk across either
+        ((1.0, 0.5), (1.0, 1.0), math.exp(-1)),
+    ],
+)
+def test_the_reward_of_a_velocity_counts_both_of_its_components(velocity, target, reward):
+    assert velocity_reward(torch.tensor(velocity), torch.tensor(target)).item() == pytest.approx(reward, abs=1e-6)
+
+
+def test_with_a_range_of_speeds_the_goal_ends_with_the_speed_that_the_reward_asks_for():
+    env = make(512, speed=(0.0, 1.5), initial_directions=(0.3, 0.3), dtype=torch.float64)
+    start = env.reset()
+    speeds = start["goal"][:, 2]
+    assert speeds.min() >= 0
+    assert speeds.max() <= 1.5
+    assert speeds.mean().item() == pytest.approx(0.75, abs=4 * 1.5 / math.sqrt(12 * 512))
+    state = env.get_state()
+    state["qpos"][:, 2] += 1  # in the air, where nothing pushes
+    state["qvel"][:, 0] = 0.8
+    start = env.reset(state, set_state=True).set("action", torch.zeros(512, 17, dtype=torch.float64))
+    reward = env.step(start)["next", "reward"].squeeze(-1)
+    missing = (0.8 - speeds * math.cos(0.3)).square() + (speeds * math.sin(0.3)).square()
+    torch.testing.assert_close(reward, (-4 * missing).exp(), atol=1e-6, rtol=0)
+
+
+def test_speeds_change_after_a_mean_time_within_their_range():
+    env = make(512, speed=(0.5, 1.0), speed_interval=0.5, terminate_on_fall=False)
+    state, seen = env.reset(), []
+    for _ in range(30):
+        seen.append(state["goal"][:, 2])
+        state = env.step(state.set("action", torch.zeros(512, 17)))["next"]
+    changes = (torch.stack(seen).diff(dim=0) != 0).float()
+    # One step in fifteen: of 29 * 512 draws, a share of 0.0667 +- 0.002.
+    assert changes.mean().item() == pytest.approx(1 / 15, abs=4 * 0.002)
+    assert torch.stack(seen).min() >= 0.5
+    assert torch.stack(seen).max() <= 1.0
+
+
+def test_a_range_without_width_is_the_papers_single_speed():
+    one, other = make(4, speed=1.0), make(4, speed=(1.0, 1.0))
+    for env in (one, other):
+        env.reset()
+        for _ in range(5):
+            env.update_goal()
+    assert torch.equal(one.episode["direction"], other.episode["direction"])
+    assert one.speeds == other.speeds
+    assert one.observation_spec["goal"].shape == other.observation_spec["goal"].shape == (4, 2)
+
+
+def test_with_a_range_of_speeds_nobody_knows_what_can_be_reached():
+    env = make(1, speed=(0.0, 1.0))
+    env.reset()
+    assert env.reach() is None
+
+
+def test_the_arrow_is_as_long_as_the_way_of_a_second():
+    env = make(8, speed=(0.0, 1.5), initial_directions=(0.7, 0.7))
+    speeds = env.reset()["goal"][:, 2]
+    for index, speed in enumerate(speeds.tolist()):
+        [(tail, tip)] = env.arrows(index)
+        assert (tip - tail).tolist() == pytest.approx([speed * math.cos(0.7), speed * math.sin(0.7), 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"max_turn": -0.1}, "max_turn=-0.1 is out of range"),
         ({"speed": float("nan")}, "speed=nan is out of range"),
+        ({"speed": 0.0}, "speed=0.0 is out of range"),
+        ({"speed": (0.0, 0.0)}, "speed=0.0 is out of range"),
+        ({"speed": (-0.5, 1.0)}, "speed=-0.5 is out of range"),
+        ({"speed": (1.0, 0.5)}, "speed=.*is no interval"),
+        ({"speed_interval": 0.0}, "speed_interval=0.0 is out of range"),
         ({"initial_directions": (1.0, 0.0)}, "initial_directions=.*is no interval"),
     ],
 )

@@ -1,0 +1,194 @@
+"""The location task: go to a place and stand there, until another place is named."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_mcp.envs.arguments import not_negative, positive
+from torchrl_mcp.envs.base import ALL
+from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
+from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.tasks.initial_states import InitialStates
+from torchrl_mcp.envs.tasks.ranges import Ranges
+from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
+from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, logarithmic, near, steps
+
+STANDING_SPEED = 0.1
+"""Speed of the centre of mass in m/s below which a character stands."""
+
+FACING = math.cos(math.radians(30))
+"""Cosine of the largest angle between the heading and the direction to face for success."""
+
+
+class Location(PDCharacterEnv):
+    """A character goes to a place and stands there; now and then, it is sent to another.
+
+    ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
+    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. With ``final_directions`` it is (4) and ends with
+    the unit vector of the direction to face at the place. The reward is
+    :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`; the reward of a step uses the place that the action could
+    see.
+
+    A character has arrived within 0.3 m of the place. Metrics: ``success`` (1, bool) is whether it has arrived and
+    stands, that is, its centre of mass is slower than 0.1 m/s, and with ``final_directions`` it faces the direction
+    within 30 degrees. ``at_place`` (1) is 1 where it has arrived, so that its mean is a share of time.
+    ``seconds_to_success`` (1) is the duration of an episode until the first success at a place, and then 0: its mean
+    over an episode with one place is the time to success, or the whole duration without success.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        target_distances: Range (lo, hi) of the distance of a new place from the character, in metres.
+        target_directions: Range (lo, hi) of the direction of a new place, in radians from the character's heading.
+        target_intervals: Range (lo, hi) of the time until another place is drawn, in seconds. It passes while the
+            character walks and while it stands.
+        final_directions: Range (lo, hi) of the direction to face at the place, in radians from the heading at the time
+            of the draw; None if the character may face any direction.
+        speed: Target speed far from the place, in m/s.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+
+    Raises:
+        ValueError: If an argument is out of range.
+
+    Reference:
+        The task is not in the paper. Peng et al., AMP: Adversarial Motion Priors for Stylized Physics-Based Character
+        Control, 2021, section 8.1, https://arxiv.org/abs/2104.02180, has a similar one, without standing.
+
+    Example:
+        >>> env = Location("biped", num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "goal"].shape
+        torch.Size([2, 3, 2])
+    """
+
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        target_distances: Sequence[float] = (0.0, 10.0),
+        target_directions: Sequence[float] = ANY_DIRECTION,
+        target_intervals: Sequence[float] = (3.0, 8.0),
+        final_directions: Sequence[float] | None = None,
+        speed: float = 1.0,
+        max_episode_steps: int = 600,
+        **kwargs: Any,
+    ) -> None:
+        positive(speed=speed)
+        self.speed, self.faces = speed, final_directions is not None
+        number, no = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool)
+        episode = {"target": number.repeat(2), "final_direction": number, "seconds_left": number}
+        super().__init__(
+            character,
+            num_envs,
+            max_episode_steps=max_episode_steps,
+            episode={**episode, "arrived": no, "success": no, "reached": no},
+            **kwargs,
+        )
+        self.initial_states = InitialStates(
+            character, self.curriculum.initial_states, self.curriculum.motions, self.device
+        )
+        ranges = {"target_distances": target_distances, "target_directions": target_directions}
+        ranges |= {"target_intervals": target_intervals, "final_directions": final_directions or (0.0, 0.0)}
+        self.ranges = Ranges(ranges, self.curriculum.mixture).to(self.device)
+        self.ranges.require_distances("target_distances")
+        shortest = self.ranges.lowest("target_intervals")
+        not_negative(target_intervals=shortest)
+        self.one_place = shortest >= max_episode_steps * self.control_timestep
+        self.make_specs()
+
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The character, and a place."""
+        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        return {**start, **self._place(start["qpos"][:, :2], torch.zeros(num, device=self.device))}
+
+    def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
+        """State of the character, the place as it sees it, and metrics."""
+        seen = [logarithmic(_turned(self._offset()[ids], -self.heading(ids)))]
+        if self.faces:
+            angle = self.episode["final_direction"][ids] - self.heading(ids)
+            seen.append(steps(torch.ones_like(angle), angle))
+        duration = self.max_episode_steps * self.control_timestep
+        return {
+            "observation": self.see(ids)[0],
+            "goal": torch.cat(seen, -1),
+            "success": self.episode["success"][ids].unsqueeze(-1),
+            "at_place": self.episode["arrived"][ids].double().unsqueeze(-1),
+            "seconds_to_success": duration * (~self.episode["reached"][ids]).double().unsqueeze(-1),
+        }
+
+    def after_step(self, diverged: Tensor) -> None:
+        """Measure whether the character has arrived, and stands."""
+        episode = self.episode
+        episode["arrived"].copy_(near(self.com, torch.nn.functional.pad(episode["target"], (0, 1)), ARRIVAL_DISTANCE))
+        stands = torch.linalg.vector_norm(self.velocity("com")[:, :2], dim=-1) < STANDING_SPEED
+        episode["success"].copy_(episode["arrived"] & stands & (self._alignment() > FACING) & ~self.fallen())
+        episode["reached"] |= episode["success"]
+
+    def reward(self) -> Tensor:
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`."""
+        return location_reward(self.velocity("com")[:, :2], self._offset(), self.speed, self._alignment())
+
+    def update_goal(self) -> None:
+        """Draw another place where the time for the last one is over."""
+        self.episode["seconds_left"] -= self.control_timestep
+        over = self.episode["seconds_left"] < self.control_timestep / 2
+        another = self._place(self.com[:, :2], self.heading())
+        for name, value in {**another, "reached": torch.zeros_like(over)}.items():
+            old = self.episode[name]
+            old.copy_(torch.where(over.view(-1, *[1] * (old.ndim - 1)), value, old))
+
+    def reach(self) -> Reach | None:
+        """See :meth:`CharacterEnv.reach`; None if an episode has several places, which are drawn as it goes on.
+
+        The ideal player goes straight to the place at the target speed, and earns the most for velocity and direction.
+        """
+        if not self.one_place:
+            return None
+        still, offset = torch.zeros_like(self._offset()), self._offset()
+        standing = self.max_episode_steps * location_reward(still, offset, self.speed, self._alignment())
+        times = torch.arange(1, self.max_episode_steps + 1, device=self.device) * self.control_timestep
+        left = (torch.linalg.vector_norm(offset, dim=-1, keepdim=True) - self.speed * times).clamp(min=0.0)
+        return Reach(standing, (0.6 + 0.4 * (-left.square()).exp()).sum(-1))
+
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
+        return mirror_signs(VECTOR_SIGNS * (2 if self.faces else 1))
+
+    def arrows(self, index: int) -> list[Arrow]:
+        """See :meth:`CharacterEnv.arrows`: an arrow down to the place, and one in the direction to face there."""
+        place = torch.nn.functional.pad(self.episode["target"][index].cpu(), (0, 1))
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        angle = self.episode["final_direction"][index].cpu()
+        ahead = torch.nn.functional.pad(steps(torch.ones_like(angle), angle), (0, 1))
+        ends = [(place + up, place), (place + 0.1 * up, place + 0.1 * up + 0.6 * ahead)]
+        return [(tail.numpy(), tip.numpy()) for tail, tip in ends[: 2 if self.faces else 1]]
+
+    def _place(self, origin: Tensor, heading: Tensor) -> dict[str, Tensor]:
+        """Draw a place for each of n characters, from where they are ``(n, 2)`` and where they face ``(n,)``."""
+        drawn = self.ranges.draw(len(origin), self.generator)
+        return {
+            "target": origin + steps(drawn["target_distances"], heading + drawn["target_directions"]),
+            "final_direction": heading + drawn["final_directions"],
+            "seconds_left": drawn["target_intervals"],
+        }
+
+    def _offset(self) -> Tensor:
+        """The place relative to the centre of mass, ``(N, 2)``, in metres."""
+        return self.episode["target"] - self.com[:, :2]
+
+    def _alignment(self, ids: Tensor | slice = ALL) -> Tensor:
+        """Cosine of the angle between heading and direction to face, 1 if any will do, ``(n,)``."""
+        angle = self.episode["final_direction"][ids] - self.heading(ids)
+        return angle.cos() if self.faces else torch.ones_like(angle)
+
+
+def _turned(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Turn horizontal vectors ``(*B, 2)`` to the left by an angle in radians, ``(*B)``."""
+    (x, y), cos, sin = vectors.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
