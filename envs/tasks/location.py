@@ -29,10 +29,9 @@ class Location(PDCharacterEnv):
     """A character goes to a place and stands there; now and then, it is sent to another.
 
     ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
-    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. With ``final_directions`` it is (4) and ends with
-    the unit vector of the direction to face at the place. The reward is
-    :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`; the reward of a step uses the place that the action could
-    see.
+    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. With ``final_directions``, ``goal`` (4) ends
+    with the unit vector of the direction to face at the place. The reward is
+    :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the action could see.
 
     A character has arrived within 0.3 m of the place. Metrics: ``success`` (1, bool) is whether it has arrived and
     stands, that is, its centre of mass is slower than 0.1 m/s, and with ``final_directions`` it faces the direction

@@ -60,10 +60,10 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
             \|v_{com}\|^2 & \|x\| < 0.3 \text{ m} \\
             (\hat{u} \cdot v_{com} - \min(\|x\| / 1 \text{ s}, \hat{v}))^2 & \text{else} \end{cases}
 
-    On the way, the second term is the paper's heading reward with the direction to the place :math:`\hat{u} = x / \|x\|`:
-    it guides the character from any distance, slows it over the last metre, and at the place asks it to stand. The first
-    term, which is flat far away, is for the last half metre. It has the direction to face as a factor, which hence
-    matters only at the place.
+    The second term guides the character from any distance. On the way it is the paper's heading reward in the direction
+    of the place, :math:`\hat{u} = x / \|x\|`, with a speed that falls over the last metre; at the place it asks for
+    standing still. The first term is for the last half metre, and flat far away. It has the direction to face as a
+    factor, so that this matters only at the place.
 
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.

@@ -10,7 +10,7 @@ import pytest
 
 REHEARSAL = Path(__file__).with_name("warp_rehearsal.py")
 NUM_STEPS = 12
-WHOM = {"heading": 2, "dribble": 2, "holdout": 2, "carry": 6, "imitation": 3}
+WHOM = {"heading": 2, "location": 2, "dribble": 2, "holdout": 2, "carry": 6, "imitation": 3}
 """How often a step asks who: who faulted, whose episodes end, who takes the box or lets it go, whose clips change."""
 WHETHER = {"imitation": 2}
 """How often a step asks whether anyone does something: whether a clip begins anew."""

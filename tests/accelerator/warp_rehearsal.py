@@ -12,7 +12,7 @@ from contextlib import redirect_stdout
 import torch
 from stand_in import NAME, Accelerator, PretendTensor, register
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location, generated_library
 from torchrl_mcp.envs.physics import warp
 
 NUM_ENVS, NUM_STEPS = 4, 12
@@ -50,7 +50,9 @@ def make(scene, device):
     if scene == "imitation":
         library = generated_library("biped", seed=0)
         return Imitation("biped", library, NUM_ENVS, terms=TERMS, switch_interval=0.2, **shared)
-    return {"heading": Heading, "carry": Carry, "dribble": Dribble}[scene]("biped", NUM_ENVS, **shared)
+    return {"heading": Heading, "location": Location, "carry": Carry, "dribble": Dribble}[scene](
+        "biped", NUM_ENVS, **shared
+    )
 
 
 def rollout(env):

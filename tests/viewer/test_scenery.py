@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.rendering.camera import Camera, arrow
@@ -85,6 +85,14 @@ def test_heading_and_holdout_show_the_direction_in_which_to_go():
         [shape] = scenery(env)
         direction = shape.orientation.reshape(3, 3)[:, 2]
         np.testing.assert_allclose(direction, [math.cos(2.0), math.sin(2.0), 0.0], atol=1e-6)
+
+
+def test_location_shows_the_place_from_above():
+    env = Location("biped", 1, seed=0, num_threads=1)
+    env.reset()
+    [shape] = scenery(env)
+    np.testing.assert_allclose(shape.position, [*env.get_state()["target"][0].tolist(), 1.0])
+    np.testing.assert_allclose(shape.orientation.reshape(3, 3)[:, 2], [0.0, 0.0, -1.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("task", [Carry, Dribble])

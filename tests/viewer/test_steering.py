@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.envs import Carry, Dribble, Heading, Location
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.viewer.player import Player
@@ -93,12 +93,16 @@ def test_a_target_is_where_it_is_put(task):
 
 
 def test_of_a_task_without_it_nothing_is_turned_or_put():
-    steering, ball = idle(Heading), idle(Dribble)
+    steering, ball, walk = idle(Heading), idle(Dribble), idle(Location)
+    assert (walk.has_direction, walk.has_place) == (False, False)
     assert (steering.has_direction, steering.has_place) == (True, False)
     assert (ball.has_direction, ball.has_place) == (False, True)
     steering.put((1.0, 1.0))
     ball.turn(1.0)
-    assert steering.place is ball.direction is None
+    walk.put((1.0, 1.0))
+    walk.turn(1.0)
+    walk.step()
+    assert steering.place is ball.direction is walk.place is walk.direction is None
 
 
 def momentum(player):

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading
+from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading, Location
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.envs.rotations import heading
@@ -60,7 +60,7 @@ def test_motions_of_another_character_are_refused():
         InitialStates("biped", "motions", single_motion("trex"))
 
 
-@pytest.mark.parametrize("task", [Carry, Dribble, Heading])
+@pytest.mark.parametrize("task", [Carry, Dribble, Heading, Location])
 def test_every_transfer_task_begins_in_motion_when_told_to(task):
     curriculum = Curriculum(initial_states=MIXED, motions=single_motion("biped"))
     env = task("biped", 200, seed=0, num_threads=1, curriculum=curriculum)
