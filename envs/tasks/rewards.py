@@ -11,7 +11,7 @@ ARRIVAL_DISTANCE = 0.3
 """Distance in metres from a place at which a character has arrived, and should stand."""
 
 
-def heading_reward(velocity: Tensor, direction: Tensor, speed: Tensor | float) -> Tensor:
+def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
     r"""Reward of the heading task: walk in a target direction at a target speed.
 
     .. math:: r = \exp(-4 (\hat{u} \cdot v_{com} - \hat{v})^2)
@@ -21,7 +21,7 @@ def heading_reward(velocity: Tensor, direction: Tensor, speed: Tensor | float) -
         direction: Target direction :math:`\hat{u}`, a unit vector, shape ``(*B, 2)``. The paper writes
             :math:`(\cos\hat{\theta}, -\sin\hat{\theta})` for a world whose y axis points up; here the z axis does, and
             :math:`\hat{u} = (\cos\hat{\theta}, \sin\hat{\theta})`.
-        speed: Target speed :math:`\hat{v}`, in m/s, shape ``(*B)`` or a number. Paper: 1.
+        speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
 
     Returns:
         Reward, shape ``(*B)``.
@@ -55,15 +55,15 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     r"""Reward of the location task: go to a place, and stand there.
 
     .. math::
-        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 e) \\
-        e &= \begin{cases}
-            \|v_{com}\|^2 & \|x\| < 0.3 \text{ m} \\
-            (\hat{u} \cdot v_{com} - \min(\|x\| / 1 \text{ s}, \hat{v}))^2 & \text{else} \end{cases}
+        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \begin{cases}
+            \exp(-4 \|v_{com}\|^2) & \|x\| < 0.3 \text{ m} \\
+            \exp(-1.5 (\hat{u} \cdot v_{com} - \min(\|x\| / 1 \text{ s}, \hat{v}))^2) & \text{else} \end{cases}
 
-    The second term guides the character from any distance. On the way it is the paper's heading reward in the direction
-    of the place, :math:`\hat{u} = x / \|x\|`, with a speed that falls over the last metre; at the place it asks for
-    standing still. The first term is for the last half metre, and flat far away. It has the direction to face as a
-    factor, so that this matters only at the place.
+    The second term guides the character from any distance, where the first is flat. On the way it rewards a speed in the
+    direction of the place :math:`\hat{u} = x / \|x\|` that falls over the last metre. Its factor is that of the paper's
+    reward for going to an object: with the 4 of the heading reward, a character that stands far away earns too little by
+    its first steps to learn them. At the place it asks for standing still. The direction to face is a factor of the
+    first term, so that it matters only at the place.
 
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
@@ -76,7 +76,8 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
         Reward, shape ``(*B)``.
     """
     distance = torch.linalg.vector_norm(offset, dim=-1)
-    approach = heading_reward(velocity, torch.nn.functional.normalize(offset, dim=-1), distance.clamp(max=speed))
+    towards = (torch.nn.functional.normalize(offset, dim=-1) * velocity).sum(-1)
+    approach = (-1.5 * (towards - distance.clamp(max=speed)).square()).exp()
     stand = velocity_reward(velocity, torch.zeros_like(velocity))
     at_place = (-distance.square()).exp() * (1 + alignment) / 2
     return 0.4 * at_place + 0.6 * torch.where(distance < ARRIVAL_DISTANCE, stand, approach)
