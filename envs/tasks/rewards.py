@@ -59,11 +59,11 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
             \exp(-4 \|v_{com}\|^2) & \|x\| < 0.3 \text{ m} \\
             \exp(-1.5 (\hat{u} \cdot v_{com} - \min(\|x\| / 1 \text{ s}, \hat{v}))^2) & \text{else} \end{cases}
 
-    The second term guides the character from any distance, where the first is flat. On the way it rewards a speed in the
-    direction of the place :math:`\hat{u} = x / \|x\|` that falls over the last metre. Its factor is that of the paper's
-    reward for going to an object: with the 4 of the heading reward, a character that stands far away earns too little by
-    its first steps to learn them. At the place it asks for standing still. The direction to face is a factor of the
-    first term, so that it matters only at the place.
+    The second term guides the character from any distance, where the first is flat. On the way it rewards a speed in
+    the direction of the place :math:`\hat{u} = x / \|x\|`, which falls over the last metre; at the place, standing
+    still. The factor 1.5 is that of the paper's reward for going to an object: with the 4 of the heading reward, a
+    character that stands far away earns too little by its first steps to learn them. The direction to face is a factor
+    of the first term, so that it matters only at the place.
 
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
