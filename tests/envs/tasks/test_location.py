@@ -32,10 +32,11 @@ def vector(*numbers):
         ((0.0, 0.0), (0.0, 0.0), 1.0, 1.0),
         ((0.0, 0.0), (0.2, 0.0), 1.0, 0.4 * math.exp(-0.04) + 0.6),
         ((0.0, 1.0), (0.0, 8.0), 1.0, 0.6 + 0.4 * math.exp(-64)),
-        ((0.0, 0.0), (0.0, 8.0), 1.0, 0.6 * math.exp(-1.5)),
-        ((1.0, 0.5), (8.0, 0.0), 1.0, 0.6),  # only the speed towards the place counts on the way,
-        ((0.6, 0.3), (0.6, 0.0), 1.0, 0.4 * math.exp(-0.36) + 0.6),  # which falls over the last metre
-        ((0.0, 0.0), (0.5, 0.0), 1.0, 0.4 * math.exp(-0.25) + 0.6 * math.exp(-0.375)),
+        ((0.0, 0.0), (0.0, 8.0), 1.0, 0.6 * math.exp(-4)),
+        ((1.0, 0.5), (8.0, 0.0), 1.0, 0.6),  # far away, only the speed towards the place counts
+        ((0.6, 0.5), (0.6, 0.0), 1.0, 0.4 * math.exp(-0.36) + 0.6 * math.exp(-1)),  # in the last metre, all motion
+        ((0.0, -0.8), (0.0, -0.8), 1.0, 0.4 * math.exp(-0.64) + 0.6),  # and the speed falls
+        ((0.0, 0.0), (0.5, 0.0), 1.0, 0.4 * math.exp(-0.25) + 0.6 * math.exp(-1)),
         ((0.0, 0.5), (0.1, 0.0), 1.0, 0.4 * math.exp(-0.01) + 0.6 * math.exp(-1)),  # at the place, all motion counts
         ((0.0, 0.0), (0.0, 0.0), -1.0, 0.6),  # at the place, back to front
         ((0.0, 0.0), (0.0, 0.0), 0.0, 0.8),
@@ -57,7 +58,7 @@ def test_the_reward_of_a_step_is_for_the_displacement_of_the_centre_of_mass_and_
     after = env.step(start)["next"]
     velocity, offset = (_centre(env) - before) * 30, np.array([2.0, 1.0]) - _centre(env)
     aim = offset / np.linalg.norm(offset)
-    expected = 0.4 * math.exp(-(offset @ offset)) + 0.6 * math.exp(-1.5 * (velocity @ aim - 1) ** 2)
+    expected = 0.4 * math.exp(-(offset @ offset)) + 0.6 * math.exp(-4 * (velocity @ aim - 1) ** 2)
     assert after["reward"][0].item() == pytest.approx(expected, rel=1e-9)
     assert not torch.equal(env.episode["target"][0], vector(2.0, 1.0))  # drawn after the reward
 
@@ -186,7 +187,7 @@ def test_the_ideal_player_walks_straight_to_the_place_and_waits():
     standing, ideal = env.reach()
     expected = sum(0.6 + 0.4 * math.exp(-(max(1.5 - step / 30, 0.0) ** 2)) for step in range(1, 91))
     torch.testing.assert_close(ideal, vector(expected).expand(3))
-    still = 90 * (0.4 * math.exp(-2.25) + 0.6 * math.exp(-1.5))
+    still = 90 * (0.4 * math.exp(-2.25) + 0.6 * math.exp(-4))
     torch.testing.assert_close(standing, vector(still).expand(3))
 
 
