@@ -5,13 +5,15 @@ from itertools import pairwise
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location
 from torchrl_mcp.envs.motions.single import single_motion
 
 TERMS = {"bodies": {"weight": 0.5, "scale": 50.0}, "velocity": {"weight": 0.5, "scale": 0.2}}
 WEIGHTS = {"reward_weights": [1.0, 0.2, 1.0, 2.0]}
 MAKERS = {
     "heading": lambda **more: Heading("biped", **more),
+    "speeds": lambda **more: Heading("biped", speed=(0.0, 1.5), **more),
+    "location": lambda **more: Location("biped", final_directions=(-1.0, 1.0), **more),
     "carry": lambda **more: Carry("biped", curriculum=WEIGHTS, success_reward=True, **more),
     "dribble": lambda **more: Dribble("biped", curriculum=WEIGHTS, success_reward=True, **more),
     "holdout": lambda **more: Holdout(directions=(0.0, 1.0), contact_forces=True, **more),
@@ -52,7 +54,7 @@ def test_a_tracked_place_has_the_velocity_of_the_last_step():
         torch.testing.assert_close(velocity, (after - before) * 30)
 
 
-@pytest.mark.parametrize("task", ["heading", "carry", "dribble"])
+@pytest.mark.parametrize("task", ["heading", "location", "carry", "dribble"])
 def test_by_default_the_best_normalised_return_is_a_reward_of_1_in_every_step(task):
     env = MAKERS[task](num_envs=1, max_episode_steps=40)
     assert env.normalised_return(torch.tensor([0.0, 40.0])).tolist() == [0.0, 1.0]
