@@ -57,7 +57,7 @@ class Location(PDCharacterEnv):
 
     Reference:
         The task is not in the paper. Peng et al., AMP: Adversarial Motion Priors for Stylized Physics-Based Character
-        Control, 2021, section 8.1, https://arxiv.org/abs/2104.02180, has a similar one, without standing.
+        Control, 2021, https://arxiv.org/abs/2104.02180, has a similar one.
 
     Example:
         >>> env = Location("biped", num_envs=2, seed=0)
