@@ -11,10 +11,8 @@ import gymnasium
 
 __version__ = "0.1.0"
 
-NAMES = [
-    *product(("Carry", "Dribble", "Heading", "Imitation", "Location"), ("biped", "humanoid", "trex")),
-    ("Holdout", "ant"),
-]
+TASKS = ("Carry", "Dribble", "Heading", "Imitation", "Location")
+NAMES = [*product(TASKS, ("biped", "humanoid", "trex")), ("Holdout", "ant")]
 """Tasks and characters of the Gymnasium environments, such as ``torchrl_mcp/Heading-Biped-v0``."""
 
 for task, character in NAMES:

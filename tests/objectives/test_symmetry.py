@@ -12,7 +12,7 @@ from torchrl_mcp.runs import build
 MIRRORED = {
     "scratch": ["method=scratch", "task=heading"],
     "mcp": ["method=mcp", "task=imitation"],
-    "mcp at transfer": ["method=mcp", "task=heading", "stage=transfer"],
+    "mcp at transfer": ["method=mcp", "task=heading", "stage=transfer", "exploration=action"],
     "moe": ["method=moe", "task=dribble", "stage=transfer"],
     "latent_space": ["method=latent_space", "task=imitation"],
     "finetune": ["method=finetune", "task=imitation"],

@@ -58,7 +58,7 @@ def test_a_published_gate_can_be_restored_as_it_was_trained(name):
 
 @pytest.mark.parametrize("setting", [{"failure_weighting": 0.5}, {"shaping": {"object": {"slope": 1.0}}}])
 def test_a_run_that_was_trained_with_what_is_removed_cannot_be_resumed(setting, tmp_path, monkeypatch):
-    config = {"stage": {"name": "pretrain"}, "task": {"pretrain": setting}}
+    config = {"stage": {"name": "pretrain"}, "task": {"pretrain": setting}, "training": {"total_frames": 128}}
     with pytest.raises(ValueError, match=rf"trained with {next(iter(setting))}=.*: resume it with the version"):
         require_resumable(config)
     unused = {"stage": {"name": "pretrain"}, "task": {"pretrain": {"failure_weighting": 0.0, "shaping": {}}}}

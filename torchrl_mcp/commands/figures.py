@@ -133,8 +133,10 @@ def _label(cfg: DictConfig) -> str:
     details = []
     if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
         details.append(cfg.mixer.name)
-    if cfg.stage.name == "transfer" and cfg.get("exploration", {}).get("name") == "weights":
-        details.append("over weights")
+    exploration = cfg.get("exploration", {})
+    explores = exploration and cfg.actor._target_ == exploration.actor._target_ and cfg.mixer.name == "multiplicative"
+    if explores and cfg.stage.name == "transfer" and exploration.name == "action":
+        details.append("over actions")
     return " ".join([cfg.method.title, *details])
 
 
