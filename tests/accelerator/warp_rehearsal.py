@@ -12,7 +12,8 @@ from contextlib import redirect_stdout
 import torch
 from stand_in import NAME, Accelerator, PretendTensor, register
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location, generated_library
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location
+from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.physics import warp
 
 NUM_ENVS, NUM_STEPS = 4, 12

@@ -143,7 +143,7 @@ def layers(run, part):
 
 
 def test_unfrozen_transfer_starts_from_the_primitives_and_trains_them(tmp_path, pretrained):
-    settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]"]
+    settings = ["stage=transfer", f"pretrained={pretrained}", "transfer.freeze=[]", "exploration=action"]
     start = build.make_agent(
         cfg := configure(tmp_path / "run", *settings),
         build.make_env(cfg, num_envs=1, seed=0),

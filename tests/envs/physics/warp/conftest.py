@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, generated_library
+from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation
 from torchrl_mcp.envs.characters import ant
+from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.tasks import holdout
 
 NUM_ENVS = 8
