@@ -37,7 +37,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(abc|argparse|collections|dataclasses|datetime|pathlib|typing)\..*"),
     (r"py:.*", r"(gymnasium|hydra|matplotlib|mujoco|numpy|omegaconf|PIL|tensordict|torch|torchrl)\..*"),
     (r"py:class", r".*\._AcceptedKeys"),  # TorchRL's way of naming keys
-    (r"py:class", r".*\.threads\.Result"),  # a type variable
+    (r"py:class", r".*\.(threads\.Result|falls\.Numbers)"),  # type variables
 ]
 
 autodoc_mock_imports = ["mujoco_warp", "warp"]  # an extra

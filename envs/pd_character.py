@@ -39,7 +39,7 @@ class PDCharacterEnv(CharacterEnv):
     names of its entries. ``com`` (N, 3) is the centre of mass, a live view, and ``velocity("com")`` its velocity.
 
     The character *falls* when any body but its feet touches the ground. That ends the episode; the reward of the fall
-    is 0, whatever :meth:`reward` returns. Episodes begin at rest. A ``curriculum`` changes training; if it has
+    is 0, whatever ``reward`` returns. Episodes begin at rest. A ``curriculum`` changes training; if it has
     ``reward_weights``, the reward is :meth:`training_reward`.
 
     Args:
