@@ -36,6 +36,7 @@ SMALL = [
     "training.minibatch_size=64",
     "training.num_epochs=1",
     "training.total_frames=64",
+    "action_std=0.1",  # the same noise in both stages
 ]
 
 

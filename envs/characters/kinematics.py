@@ -72,5 +72,7 @@ def origin_velocities(angular: Array, linear: Array, arms: Array) -> Array:
     Returns:
         Shape ``(L, 3, n)``, in m/s.
     """
+    if isinstance(angular, Tensor):  # on a device, lists of indices would wait for the processor
+        return torch.linalg.cross(angular, arms, dim=1) + linear
     across = angular[:, [1, 2, 0]] * arms[:, [2, 0, 1]] - angular[:, [2, 0, 1]] * arms[:, [1, 2, 0]]
     return across + linear

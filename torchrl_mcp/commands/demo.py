@@ -8,6 +8,8 @@ import math
 import shlex
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -150,15 +152,16 @@ def remark(runs: Runs) -> str:
 
 def learn(runs: Sequence[DictConfig]) -> None:
     """Train and evaluate runs, one after the other."""
-    for cfg in runs:
-        experiment.train_or_resume(cfg)
+    with redirect_stdout(StringIO()):  # one line of progress tells of both
+        for cfg in runs:
+            experiment.train_or_resume(cfg)
 
 
 def show_progress(processes: Sequence[BaseProcess], runs: Runs) -> None:
     """Show one line of progress of all runs until they are trained, then until they are evaluated."""
     total, done = sum(map(_steps, runs.values())), sum(progress(cfg)[0] for cfg in runs.values())
     moments = ticks(processes, interval=1.0)
-    with TrainingBar(total, done) as line:
+    with TrainingBar(total, done, estimate=False) as line:
         for _ in moments:
             now = {TITLES[name]: progress(cfg) for name, cfg in runs.items()}
             before, done = done, sum(steps for steps, _ in now.values())

@@ -35,16 +35,19 @@ class TrainingBar:
         total: Environment steps of the training; the last batch may exceed it.
         done: Steps so far.
         shown: Whether to show anything.
+        estimate: Say after the first batches how long it will take.
         file: Output stream, standard error by default.
     """
 
-    def __init__(self, total: int, done: int = 0, *, shown: bool = True, file: TextIO | None = None) -> None:
+    def __init__(
+        self, total: int, done: int = 0, *, shown: bool = True, estimate: bool = True, file: TextIO | None = None
+    ) -> None:
         self._file = file or sys.stderr
         self._total, self._done, self._first, self._shown = total, done, done, shown
         self._began = self._told = time.monotonic()
         self._note = ""
         self._second: tuple[float, int] | None = None  # time and steps at the beginning of the second batch
-        self._estimated = not shown
+        self._estimated = not (shown and estimate)
         form = "{n_fmt}/{total_fmt} {rate_fmt} {elapsed}<{remaining}{postfix}"
         self._bar: tqdm | None = None
         if shown and self._file.isatty():
