@@ -10,10 +10,8 @@ from tensordict.nn import TensorDictModule
 from torchrl_mcp.analysis import (
     Trajectories,
     draw_trajectories,
-    load_trajectories,
     play_directions,
     save_figure,
-    save_trajectories,
 )
 from torchrl_mcp.envs import Holdout
 
@@ -67,15 +65,6 @@ def test_one_direction_per_environment_is_required():
     env = Holdout(2, (0.0, 1.0), seed=0, num_threads=1)
     with pytest.raises(ValueError, match="pass one per environment"):
         play_directions(TensorDictModule(Listener(), in_keys=["goal"], out_keys=["action"]), env, torch.zeros(3))
-
-
-def test_trajectories_survive_saving(tmp_path):
-    trajectories = rays([0.0, 1.0])
-    trajectories.positions[10:, 0] = np.nan
-    save_trajectories(trajectories, tmp_path / "paths.npz")
-    loaded = load_trajectories(tmp_path / "paths.npz")
-    np.testing.assert_array_equal(loaded.directions, trajectories.directions)
-    np.testing.assert_array_equal(loaded.positions, trajectories.positions)
 
 
 def marks(axes):

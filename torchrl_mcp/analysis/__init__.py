@@ -5,9 +5,7 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import (
     Trajectories,
     draw_trajectories,
-    load_trajectories,
     play_directions,
-    save_trajectories,
 )
 from torchrl_mcp.training.run_folder import read_metrics
 
@@ -17,10 +15,8 @@ __all__ = [
     "draw_curves",
     "draw_trajectories",
     "learning_curves",
-    "load_trajectories",
     "play_directions",
     "read_metrics",
     "save_figure",
-    "save_trajectories",
     "write_curves",
 ]

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -55,18 +54,6 @@ def play_directions(
     start["goal"] = torch.stack([directions.cos(), directions.sin()], -1).to(start["goal"].dtype)
     outcome = evaluate(policy, env, deterministic=deterministic, start=start)
     return Trajectories(directions.numpy().astype(np.float64), outcome.positions.numpy())
-
-
-def save_trajectories(trajectories: Trajectories, path: Path) -> None:
-    """Write trajectories as a NumPy archive of ``directions`` and ``positions``."""
-    with path.open("wb") as file:
-        np.savez_compressed(file, directions=trajectories.directions, positions=trajectories.positions)
-
-
-def load_trajectories(path: Path) -> Trajectories:
-    """Read a file of :func:`save_trajectories`."""
-    with np.load(path) as archive:
-        return Trajectories(archive["directions"], archive["positions"])
 
 
 def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
