@@ -197,7 +197,8 @@ def _rest(model: mujoco.MjModel) -> Iterator[Violation]:
     lowest, _ = lowest_bodies(model)
     if abs(lowest) > SOLE:
         yield Violation(
-            f"rests {lowest:+.3f} m above the ground", f"{'lower' if lowest > 0 else 'raise'} the root by {abs(lowest):.3f} m: soles are on z = 0"
+            f"rests {lowest:+.3f} m above the ground",
+            f"{'lower' if lowest > 0 else 'raise'} the root by {abs(lowest):.3f} m: soles are on z = 0",
         )
 
 

@@ -73,10 +73,7 @@ def mirror_actions(model: mujoco.MjModel, *, sides: Sides = SIDES) -> Mirror:
     axes = torch.tensor([_axis(model, index) for index in range(model.nu)])
     joints = [model.joint(index).name for index in model.actuator_trnid[:, 0]]
     sources = torch.tensor(
-        [
-            names.index(twin(joint, sides) + name.removeprefix(joint))
-            for joint, name in zip(joints, names, strict=True)
-        ]
+        [names.index(twin(joint, sides) + name.removeprefix(joint)) for joint, name in zip(joints, names, strict=True)]
     )
     signs = (axes * axes[sources] * torch.tensor([-1.0, 1.0, -1.0])).sum(-1).round()
     return Mirror(sources.tolist(), signs.tolist())

@@ -108,7 +108,9 @@ def _put_within(model: mujoco.MjModel, data: mujoco.MjData, hinges: Sequence[int
         names = [model.joint(hinge).name for hinge in np.array(limited)[beyond]]
         shown = [
             f"{name} ({low_} to {high_})"
-            for name, low_, high_ in zip(names, *np.round(model.jnt_range[limited].T[:, beyond], 3).tolist(), strict=True)
+            for name, low_, high_ in zip(
+                names, *np.round(model.jnt_range[limited].T[:, beyond], 3).tolist(), strict=True
+            )
         ]
         raise ValueError(
             f"the rest pose is beyond the range in radians of {', '.join(shown)}: choose one within it, such as "
