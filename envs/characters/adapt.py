@@ -190,11 +190,10 @@ def _require_convertible(model: mujoco.MjModel, tree: Sequence[int], names: Mapp
 
 
 def _possible(inertia: np.ndarray) -> np.ndarray:
-    """Principal moments that stay possible when a file rounds them: the largest is at most the sum of the others."""
+    """Principal moments that stay possible when a file rounds them: none exceeds the sum of the others."""
+    smallest, middle, largest = inertia.argsort()
     inertia = np.maximum(inertia, LEAST_INERTIA)
-    largest = int(inertia.argmax())
-    others = inertia.sum() - inertia[largest]
-    inertia[largest] = min(inertia[largest], 0.9999 * others)
+    inertia[smallest] = max(inertia[smallest], 1.0001 * inertia[largest] - inertia[middle])
     return inertia
 
 

@@ -11,6 +11,9 @@ SECONDS = 2.0
 SUNK = 0.75
 """Part of its height in the rest pose below which a root no longer stands."""
 
+DIVERGED = 1e3
+"""Velocity in m/s or rad/s that no body reaches unless its simulation diverges."""
+
 TILTED = 0.5
 """Angle in radians from the rest pose beyond which a root no longer stands."""
 
@@ -45,7 +48,7 @@ def collapse(spec: mujoco.MjSpec, feet: tuple[str, ...], *, seconds: float = SEC
     for step in range(1, steps + 1):
         mujoco.mj_step(model, data)
         when = f"after {step * model.opt.timestep:.2g} s {_furthest(model, data)}"
-        if data.warning.number.any():
+        if data.warning.number.any() or not abs(data.qvel).max() < DIVERGED:
             return f"its simulation diverges {when}"
         lows = lowest_points(data.geom_xpos[falling, 2], data.geom_xmat[falling, 6:], half_sizes, radii)
         if (lows < 0).any():

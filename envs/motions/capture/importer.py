@@ -197,7 +197,7 @@ def _of_clip(
     parts = key_map(clip.character, joint_map)
     followers = {} if character in HUMANS else key_map(character, bodies)
     followers = {part: body for part, body in followers.items() if part in parts}
-    return _retargeted(as_source(clip, path), character, rate, kind, followers, joint_map=parts, skip=skip)
+    return _retargeted(as_source(clip, path), character, rate, kind, followers, joint_map=parts, skip=skip, scale=1.0)
 
 
 def _assembled(
