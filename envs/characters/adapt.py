@@ -82,33 +82,15 @@ def adapted(
             pose is beyond the limits of a joint or not on feet.
     """
     trunk = _root(model, root)
-    tree = [body for body in range(1, model.nbody) if trunk in _line(model, body)]
-    names = {body: model.body(body).name or f"body_{body}" for body in tree}
-    _require_convertible(model, tree, names)
-    rest = Pose.read(model, pose, tree)
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    bodies = {model.body_parentid[trunk]: spec.worldbody}
-    for body in tree:
-        place, turn = rest.relative(body, trunk)
-        bodies[body] = bodies[model.body_parentid[body]].add_body(
-            name=names[body],
-            pos=place,
-            quat=turn,
-            explicitinertial=True,
-            mass=model.body_mass[body],
-            ipos=model.body_ipos[body],
-            iquat=model.body_iquat[body],
-            inertia=_possible(model.body_inertia[body]),
-        )
-        _add_joint(bodies[body], names[body], model, body, rest)
-        _add_shapes(bodies[body], model, body)
-    lowest, found = lowest_bodies(spec.compile())
-    bodies[trunk].pos = bodies[trunk].pos - [0.0, 0.0, lowest]
-    standing = _feet(feet, found, names, trunk)
+    names = {
+        body: model.body(body).name or f"body_{body}" for body in range(1, model.nbody) if trunk in _line(model, body)
+    }
+    _require_convertible(model, names)
+    rest = Pose.read(model, pose, list(names))
+    spec = _standing(model, names, rest)
+    soles = _feet(feet, lowest_bodies(spec.compile())[1], names)
     jointed = {body: name for body, name in names.items() if body != trunk and joints_of(model, body)}
-    drives = _drives(spec.compile(), model, jointed, standing, torques or {}, gains or {})
+    drives = _drives(spec.compile(), model, jointed, soles, torques or {}, gains or {})
     for body, name in jointed.items():
         joint, own = spec.joint(name), drives[name]
         joint.damping[0], joint.stiffness[0] = own.passive, own.spring
@@ -117,12 +99,36 @@ def adapted(
     return Adapted(
         spec,
         names[trunk],
-        standing,
+        soles,
         guessed_sides(names.values()) if sides is None else sides,
         drives,
-        {joint.name: (joint.range[0], joint.range[1]) for joint in spec.joints if joint.name in drives},
-        tuple(model.body(body).name for body in _roots(model) if body != trunk and trunk not in _line(model, body)),
+        {name: (spec.joint(name).range[0], spec.joint(name).range[1]) for name in drives},
+        tuple(model.body(body).name for body in _roots(model) if body not in _line(model, trunk)),
     )
+
+
+def _standing(model: mujoco.MjModel, names: Mapping[int, str], rest: Pose) -> mujoco.MjSpec:
+    """Build the body in its rest pose on the ground, without servos."""
+    spec, trunk = mujoco.MjSpec(), next(iter(names))
+    spec.compiler.degree = False
+    spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    bodies = {model.body_parentid[trunk]: spec.worldbody}
+    for body, name in names.items():
+        place, turn = rest.relative(body, trunk)
+        bodies[body] = bodies[model.body_parentid[body]].add_body(
+            name=name,
+            pos=place,
+            quat=turn,
+            explicitinertial=True,
+            mass=model.body_mass[body],
+            ipos=model.body_ipos[body],
+            iquat=model.body_iquat[body],
+            inertia=_possible(model.body_inertia[body]),
+        )
+        _add_joint(bodies[body], name, model, body, rest)
+        _add_shapes(bodies[body], model, body)
+    bodies[trunk].pos = bodies[trunk].pos - [0.0, 0.0, lowest_bodies(spec.compile())[0]]
+    return spec
 
 
 def _drives(
@@ -176,10 +182,11 @@ def _root(model: mujoco.MjModel, name: str | None) -> int:
     return int(np.bincount(model.body_rootid[1:]).argmax())
 
 
-def _require_convertible(model: mujoco.MjModel, tree: Sequence[int], names: Mapping[int, str]) -> None:
-    if kinds_of(model, tree[0]) not in ([], [FREE]):
-        raise ValueError(f"the root {names[tree[0]]} has joints other than a free joint: replace them by a freejoint")
-    for body in tree[1:]:
+def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> None:
+    trunk, *others = names
+    if kinds_of(model, trunk) not in ([], [FREE]):
+        raise ValueError(f"the root {names[trunk]} has joints other than a free joint: replace them by a freejoint")
+    for body in others:
         kinds = kinds_of(model, body)
         if any(kind not in (BALL, HINGE) for kind in kinds) or (BALL in kinds and len(kinds) > 1):
             raise ValueError(f"{names[body]} has a joint that is neither hinge nor ball: replace or weld it")
@@ -197,15 +204,15 @@ def _possible(inertia: np.ndarray) -> np.ndarray:
     return inertia
 
 
-def _feet(given: Sequence[str] | None, lowest: Sequence[str], names: Mapping[int, str], trunk: int) -> tuple[str, ...]:
+def _feet(given: Sequence[str] | None, lowest: Sequence[str], names: Mapping[int, str]) -> tuple[str, ...]:
     every = list(names.values())
     if given is not None:
         if unknown := [name for name in given if name not in every]:
             raise ValueError(f"there is no body {', '.join(unknown)} for the feet: name some of {', '.join(every)}")
         return tuple(given)
-    if names[trunk] in lowest:
+    if every[0] in lowest:
         raise ValueError(
-            f"{names[trunk]}, the root, is lowest in the rest pose: choose one that stands on feet, such as --pose "
+            f"{every[0]}, the root, is lowest in the rest pose: choose one that stands on feet, such as --pose "
             "KEYFRAME or --pose knee=-1.2, or name the feet (--feet)"
         )
     return tuple(lowest)

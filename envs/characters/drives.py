@@ -1,7 +1,7 @@
 """Torques and gains of a body's joints: those of its file, those given, and guesses for the rest."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -172,8 +172,15 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
         steady,
         friction=float(model.dof_frictionloss[dofs].max()),
         spring=float(model.jnt_stiffness[joints].max()),
-        remark=f"armature {armature:.3g} raised" if 0 < armature < steady else "",
+        remark=", ".join(_remarks(len(joints), armature, steady)),
     )
+
+
+def _remarks(joints: int, armature: float, steady: float) -> Iterator[str]:
+    if joints > 1:
+        yield f"a ball for {joints} hinges"
+    if 0 < armature < steady:
+        yield f"armature {armature:.3g} raised"
 
 
 def matched(patterns: Mapping[str, float], names: Mapping[int, Sequence[str]], option: str) -> dict[int, float]:
@@ -187,7 +194,7 @@ def matched(patterns: Mapping[str, float], names: Mapping[int, Sequence[str]], o
     Raises:
         ValueError: If a pattern is found in no name.
     """
-    found = {}
+    found: dict[int, float] = {}
     for pattern, value in patterns.items():
         bodies = [body for body, known in names.items() if any(re.search(pattern, name) for name in known)]
         if not bodies:

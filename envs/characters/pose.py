@@ -101,19 +101,19 @@ def _keyframe(model: mujoco.MjModel, word: str) -> int:
 
 def _put_within(model: mujoco.MjModel, data: mujoco.MjData, hinges: Sequence[int]) -> None:
     """Check that hinges are within their limits, and move them there if rounding exceeds these."""
-    limited = [hinge for hinge in hinges if model.jnt_limited[hinge]]
-    places, low, high = model.jnt_qposadr[limited], *model.jnt_range[limited].T
-    beyond = abs(data.qpos[places] - data.qpos[places].clip(low, high)) > TOLERANCE
-    if beyond.any():
-        names = [model.joint(hinge).name for hinge in np.array(limited)[beyond]]
-        shown = [
-            f"{name} ({low_} to {high_})"
-            for name, low_, high_ in zip(
-                names, *np.round(model.jnt_range[limited].T[:, beyond], 3).tolist(), strict=True
-            )
-        ]
+    beyond = []
+    for hinge in hinges:
+        if not model.jnt_limited[hinge]:
+            continue
+        place, (low, high) = model.jnt_qposadr[hinge], model.jnt_range[hinge].tolist()
+        angle = float(data.qpos[place])
+        data.qpos[place] = min(max(angle, low), high)
+        if abs(data.qpos[place] - angle) > TOLERANCE:
+            beyond.append((model.joint(hinge).name, low, high))
+    if beyond:
+        shown = ", ".join(f"{name} ({low:.3g} to {high:.3g})" for name, low, high in beyond)
+        name, low, high = beyond[0]
         raise ValueError(
-            f"the rest pose is beyond the range in radians of {', '.join(shown)}: choose one within it, such as "
-            f"--pose KEYFRAME or --pose {names[0]}={float((low + high)[beyond][0] / 2):.2f}"
+            f"the rest pose is beyond the range in radians of {shown}: choose one within it, such as --pose KEYFRAME "
+            f"or --pose {name}={(low + high) / 2:.2f}"
         )
-    data.qpos[places] = data.qpos[places].clip(low, high)

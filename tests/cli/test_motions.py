@@ -89,6 +89,7 @@ def test_a_clip_reaches_a_character_of_a_module_with_the_bodies_that_are_printed
     assert (status, errors) == (0, "")
     assert "lizard follows with root: root, chest: chest, right_hip: right_hip" in output
     assert "neck: upper_neck" in output
+    assert re.search(r"Bones miss their directions in walk by \d+\.\d deg in the median", output)
     assert MotionClip.load(tmp_path / "clips" / "walk.npz").character == "lizard"
     assert "follows" not in run("inspect", "clips/walk.npz", "--module", "lizard")[1]
 

@@ -172,6 +172,12 @@ def _table(motions: Mapping[str, Import]) -> str:
     total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
     rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
     lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
+    for name, motion in motions.items():
+        if motion.bodies:
+            often, most = (float(motion.missed.quantile(share)) for share in (0.5, 1.0))
+            lines += (
+                f"\nBones miss their directions in {name} by {often:.1f} deg in the median, {most:.1f} deg at most."
+            )
     for character, bodies in {motion.clip.character: motion.bodies for motion in motions.values()}.items():
         if bodies:
             pairs = ", ".join(f"{part}: {body}" for part, body in bodies.items())

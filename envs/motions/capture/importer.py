@@ -60,10 +60,11 @@ class Import(NamedTuple):
         clip: The motion.
         rest_lean: Greatest angle in degrees between the vertical and trunk or legs in the pose that was taken for
             standing upright: a bound on the error of leans in the clip. NaN for files of the character's own joints.
-        cut: Greatest angle in degrees by which a joint of each frame of the file was cut to the character's limits, or
-            by which inverse kinematics misses the direction of a bone, shape ``(T,)``; empty for clips.
+        cut: Greatest angle in degrees by which a joint of each frame of the file was cut to the character's limits,
+            shape ``(T,)``; empty for clips.
         assumed: What was assumed about the standing pose against that of the file; or nothing.
         bodies: Bodies of the character by part of the recorded person, if inverse kinematics fitted them.
+        missed: Greatest angle in degrees by which a bone of them misses its direction in each frame, shape ``(T,)``.
     """
 
     clip: MotionClip
@@ -71,6 +72,7 @@ class Import(NamedTuple):
     cut: Tensor = torch.empty(0)
     assumed: str = ""
     bodies: Mapping[str, str] = MappingProxyType({})
+    missed: Tensor = torch.empty(0)
 
 
 def import_motion(path: str | Path, character: str, **options: Any) -> MotionClip:
@@ -176,8 +178,10 @@ def _retargeted(
     arms = [part for side in SIDES for part in limb(side, ARM) if limb(side, ARM)[0] in bodies]
     body = record(source, tuple(dict.fromkeys((*TRUNK, *LEGS, *arms, *bodies))), **skeletal)
     motion, missed = solved(body, character, bodies)
-    found = _assembled(source.path, character, motion, rate, kind, missed)
-    return found._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies)
+    missed = torch.rad2deg(missed)
+    _require_within(source.path, missed, kind)
+    found = _assembled(source.path, character, motion, rate, kind)
+    return found._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies, missed=missed)
 
 
 def _of_clip(
@@ -200,12 +204,10 @@ def _of_clip(
     return _retargeted(as_source(clip, path), character, rate, kind, followers, joint_map=parts, skip=skip, scale=1.0)
 
 
-def _assembled(
-    path: str | Path, character: str, motion: JointMotion, rate: float, kind: str, missed: Tensor | None = None
-) -> Import:
+def _assembled(path: str | Path, character: str, motion: JointMotion, rate: float, kind: str) -> Import:
     """Make a clip of a motion, if limits leave most of it as it is."""
     clip, cut = assembled(character, motion, rate=rate)
-    degrees = torch.rad2deg(cut if missed is None else torch.maximum(cut, missed))
+    degrees = torch.rad2deg(cut)
     _require_within(path, degrees, kind)
     return Import(clip, cut=degrees)
 

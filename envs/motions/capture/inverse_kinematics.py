@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from types import ModuleType
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -99,7 +100,7 @@ def _targets(
     turned = {part: torch.from_numpy(data.body(name).xquat.copy()) for part, name in bodies.items()}
     positions = _legs(body, rest)
     positions |= _upper_body(body, rest, positions["root"])
-    turns = body.turns | {ankle: flat(body, ankle) for ankle in ANKLES}
+    turns = {**body.turns} | {ankle: flat(body, ankle) for ankle in ANKLES}
     return positions, {part: multiply(turns[part], turned[part].expand_as(turns[part])) for part in bodies}
 
 
@@ -161,7 +162,7 @@ def _poses(positions: Tensor, turns: Tensor) -> np.ndarray:
 
 
 def _solve(
-    mink: ModuleType, model: mujoco.MjModel, tasks: Mapping[str, object], poses: Mapping[str, np.ndarray]
+    mink: ModuleType, model: mujoco.MjModel, tasks: Mapping[str, Any], poses: Mapping[str, np.ndarray]
 ) -> Tensor:
     """States that follow the poses, ``(T, nq)``."""
     configuration = mink.Configuration(model, model.qpos0)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import yaml
+import yaml  # type: ignore[import-untyped]
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
@@ -79,7 +79,8 @@ def _central(bodies: list[str]) -> dict[str, str]:
 def _limbs(bodies: list[str], sides: Sides) -> dict[str, str]:
     """Find the bodies of legs and arms by side."""
     found: dict[str, str] = {}
-    for side, affixes in zip(SIDES, zip(*sides, strict=True), strict=True):
+    for index, side in enumerate(SIDES):
+        affixes = [pair[index] for pair in sides]
         own = {
             body: _plain(body.removeprefix(affix).removesuffix(affix))
             for affix in affixes

@@ -42,6 +42,6 @@ def test_root_pose_feet_sides_and_joints_are_shown(robot):
 def test_the_pose_of_the_go1s_file_is_refused_with_a_remedy(robot_file, command, tmp_path):
     done = command("character", "adapt", robot_file("go1"), "--name", "dog", cwd=tmp_path)
     assert done.returncode == 1
-    assert "beyond the range in radians of FR_calf_joint (-2.818 to -0.888)" in done.stderr
+    assert "beyond the range in radians of FR_calf_joint (-2.82 to -0.888)" in done.stderr
     assert "--pose FR_calf_joint=-1.85" in done.stderr
     assert list(tmp_path.iterdir()) == []
