@@ -29,7 +29,7 @@ def key_map(character: str, given: Mapping[str, str] | None = None) -> dict[str,
             :func:`~torchrl_mcp.envs.motions.capture.anatomy.find_joints` for the names of the parts.
 
     Returns:
-        Names of bodies by part: the root, legs and what else was found.
+        Names of bodies by part, of root, legs and what else was found.
 
     Raises:
         ValueError: If the map has an unknown part or body, or no body is known for a part of the legs.
