@@ -15,7 +15,7 @@ Command = Callable[[Steering], None]
 WIDTH, HEIGHT = 160.0, 14.0
 """Size of a bar in pixels."""
 
-KEYS = "drag a body: push\nspace: pause   - =: slower, faster\nup, down: one primitive alone"
+KEYS = "drag a body: push   - =: slower, faster"
 
 
 def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], None]) -> None:
@@ -34,6 +34,11 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
         if turned:
             send(lambda steering: steering.aim(angle))
         imgui.TextDisabled("left, right: turn by 15 degrees")
+    if steering.has_speed:
+        imgui.TextDisabled(f"up, down: speed, now {steering.target_speed:.2f} m/s")
+    elif steering.player.has_gates:
+        imgui.TextDisabled("up, down: one primitive alone")
+    imgui.TextDisabled(f"space: {'stop' if steering.can_stop else 'pause'}")
     if steering.has_place:
         imgui.TextDisabled("click on the ground: place the target")
     if weights is not None:
