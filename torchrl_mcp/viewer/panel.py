@@ -15,8 +15,6 @@ Command = Callable[[Steering], None]
 WIDTH, HEIGHT = 160.0, 14.0
 """Size of a bar in pixels."""
 
-KEYS = "drag a body: push   - =: slower, faster"
-
 
 def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], None]) -> None:
     """Draw the panel for a frame.
@@ -36,9 +34,6 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
         imgui.TextDisabled("left, right: turn by 15 degrees")
     if steering.has_speed:
         imgui.TextDisabled(f"up, down: speed, now {steering.target_speed:.2f} m/s")
-    elif steering.player.has_gates:
-        imgui.TextDisabled("up, down: one primitive alone")
-    imgui.TextDisabled(f"space: {'stop' if steering.can_stop else 'pause'}")
     if steering.has_place:
         imgui.TextDisabled("click on the ground: place the target")
     if weights is not None:
@@ -48,7 +43,9 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
     imgui.SameLine()
     if imgui.Button("let go"):
         send(Steering.let_go)
-    imgui.TextDisabled(KEYS)
+    imgui.TextDisabled(f"drag a body: push\nspace: {'stop' if steering.can_stop else 'pause'}   - =: slower, faster")
+    if not steering.has_speed:
+        imgui.TextDisabled("up, down: one primitive alone")
     imgui.End()
 
 
