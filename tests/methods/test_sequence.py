@@ -41,16 +41,14 @@ class Primitives(nn.Module):
         return loc, torch.full_like(loc, 0.1)
 
 
-def act(primitives, logits, until):
+def act(primitives, logits, until=None):
     parts = {"observation_normaliser": nn.Identity(), "goal_normaliser": nn.Identity(), "primitives": primitives}
-    return Act(nn.ModuleDict({**parts, "gating": Constant(logits)}), lambda env: torch.zeros(env.num_envs, 2), until)
+    return Act(nn.ModuleDict({**parts, "gating": Constant(logits)}), until)
 
 
 def play(env, acts, steps, **settings):
     """Return the gates of every step, ``(steps, N, K)``."""
-    policy = GatesInARow(
-        env, acts, gate_activation=torch.sigmoid, distribution_class=MultiplicativeGaussian, **settings
-    )
+    policy = GatesInARow(env, acts, **settings)
     state, gates = env.reset(), []
     for _ in range(steps):
         state = policy(state)
@@ -67,14 +65,10 @@ def after(*seconds):
     return lambda env: env.episode["elapsed_steps"].flatten() >= torch.tensor(seconds) * 30
 
 
-def never(env):
-    return torch.zeros(env.num_envs, dtype=torch.bool)
-
-
 def test_weights_fade_linearly_from_one_act_to_the_next_in_every_simulation_at_its_own_time():
     env, primitives = Heading("biped", 2, seed=0, num_threads=1, terminate_on_fall=False), Primitives()
     low, high = math.log(0.2 / 0.8), math.log(0.8 / 0.2)
-    acts = [act(primitives, [low, high], after(0.2, 0.4)), act(primitives, [high, high], never)]
+    acts = [act(primitives, [low, high], after(0.2, 0.4)), act(primitives, [high, high])]
     first = play(env, acts, 20, crossfade=0.3)[..., 0]
     steps = torch.arange(20).unsqueeze(-1)
     expected = 0.2 + 0.6 * ((steps - torch.tensor([6, 12]) + 1) / 9).clamp(0, 1)
@@ -83,15 +77,15 @@ def test_weights_fade_linearly_from_one_act_to_the_next_in_every_simulation_at_i
 
 def test_an_episode_begins_with_the_first_act():
     env, primitives = Heading("biped", 1, seed=0, num_threads=1, max_episode_steps=5), Primitives()
-    acts = [act(primitives, [0.0, 0.0], after(0.1)), act(primitives, [20.0, 0.0], never)]
+    acts = [act(primitives, [0.0, 0.0], after(0.1)), act(primitives, [20.0, 0.0])]
     first = play(env, acts, 10, crossfade=0.0)[:, 0, 0]
     assert first.tolist() == pytest.approx([0.5, 0.5, 0.5, 1.0, 1.0] * 2)
 
 
 def test_the_primitives_are_evaluated_once_for_all_gates():
     env, primitives = Heading("biped", 1, seed=0, num_threads=1), Primitives()
-    acts = [act(primitives, [0.0, 0.0], never) for _ in range(5)]
-    policy = GatesInARow(env, acts, gate_activation=torch.sigmoid, distribution_class=MultiplicativeGaussian)
+    acts = [act(primitives, [0.0, 0.0]) for _ in range(5)]
+    policy = GatesInARow(env, acts)
     policy(env.reset())
     assert primitives.calls == 1
 
@@ -100,13 +94,12 @@ def test_acts_over_other_primitives_and_bad_durations_are_refused():
     env, here, there = Heading("biped", 1, seed=0, num_threads=1), Primitives(), Primitives()
     with torch.no_grad():
         there.mean.add_(0.1)
-    settings = {"gate_activation": torch.sigmoid, "distribution_class": MultiplicativeGaussian}
     with pytest.raises(ValueError, match="act 1 has another primitives than act 0"):
-        GatesInARow(env, [act(here, [0.0, 0.0], never), act(there, [0.0, 0.0], never)], **settings)
+        GatesInARow(env, [act(here, [0.0, 0.0]), act(there, [0.0, 0.0])])
     with pytest.raises(ValueError, match="no acts"):
-        GatesInARow(env, [], **settings)
+        GatesInARow(env, [])
     with pytest.raises(ValueError, match="crossfade=-1"):
-        GatesInARow(env, [act(here, [0.0, 0.0], never)], crossfade=-1.0, **settings)
+        GatesInARow(env, [act(here, [0.0, 0.0])], crossfade=-1.0)
 
 
 def test_built_in_gates_walk_to_the_ball_and_then_dribble():
@@ -126,8 +119,8 @@ def test_built_in_gates_walk_to_the_ball_and_then_dribble():
     def arrived(env):
         return (ball() - env.com[:, :2]).norm(dim=-1) < 1.0
 
-    acts = [Act(heading.parts, towards, arrived), Act(dribble.parts, lambda env: player.state["goal"], never)]
-    policy = GatesInARow(env, acts, gate_activation=torch.sigmoid, distribution_class=MultiplicativeGaussian)
+    acts = [Act(heading.parts, arrived, towards), Act(dribble.parts)]
+    policy = GatesInARow(env, acts)
     player = Player(policy, env)
     start = ball().clone()
     reached = None

@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.actor import Composition
 
@@ -18,13 +19,13 @@ class Act:
 
     Attributes:
         parts: Parts of the policy, with ``observation_normaliser`` and ``primitives`` equal to those of the other acts.
-        goal: Goals that the gate sees, ``(N, G)``, from the environment, which may be of another task.
-        until: Whether the act is over, ``(N,)``, bool, from the environment.
+        until: Whether the act is over, ``(N,)``, bool, from the environment; None if it never is.
+        goal: Goals that the gate sees, ``(N, G)``, from the environment of another task; None for its own goals.
     """
 
     parts: nn.ModuleDict
-    goal: Callable[[CharacterEnv], Tensor]
-    until: Callable[[CharacterEnv], Tensor]
+    until: Callable[[CharacterEnv], Tensor] | None = None
+    goal: Callable[[CharacterEnv], Tensor] | None = None
 
 
 class GatesInARow(TensorDictModuleBase):
@@ -38,9 +39,9 @@ class GatesInARow(TensorDictModuleBase):
     Args:
         env: The environment that the policy plays in.
         acts: The acts.
-        gate_activation: From logits to weights.
-        distribution_class: The mixer, of ``(loc, scale, gates)``.
         crossfade: Duration of a change of acts in seconds.
+        gate_activation: From logits to weights, that of the gates' training.
+        distribution_class: The mixer, of ``(loc, scale, gates)``.
 
     Raises:
         ValueError: If the acts differ in their primitives or the normalisation of the state, or ``crossfade`` is
@@ -50,7 +51,7 @@ class GatesInARow(TensorDictModuleBase):
         act: Number of the act of each simulation, ``(N,)``.
     """
 
-    in_keys = ["observation"]  # noqa: RUF012, the interface of TensorDictModule
+    in_keys = ["observation", "goal"]  # noqa: RUF012, the interface of TensorDictModule
     out_keys = ["gates", "action"]  # noqa: RUF012
 
     def __init__(
@@ -58,9 +59,9 @@ class GatesInARow(TensorDictModuleBase):
         env: CharacterEnv,
         acts: Sequence[Act],
         *,
-        gate_activation: Callable[[Tensor], Tensor],
-        distribution_class: Composition,
         crossfade: float = 0.3,
+        gate_activation: Callable[[Tensor], Tensor] = torch.sigmoid,
+        distribution_class: Composition = MultiplicativeGaussian,
     ) -> None:
         super().__init__()
         _require_same(acts)
@@ -73,11 +74,11 @@ class GatesInARow(TensorDictModuleBase):
         self.shares = torch.zeros(env.num_envs, len(acts))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``gates`` ``(N, K)`` and the deterministic ``action`` ``(N, A)`` for an ``observation`` ``(N, S)``."""
+        """Write ``gates`` ``(N, K)`` and the deterministic ``action`` ``(N, A)`` for ``observation`` and ``goal``."""
         self._advance()
         parts = self.acts[0].parts
         state = parts["observation_normaliser"](tensordict["observation"])
-        gates = torch.stack([self._gates(act, state) for act in self.acts], -1)  # (N, K, acts)
+        gates = torch.stack([self._gates(act, state, tensordict["goal"]) for act in self.acts], -1)  # (N, K, acts)
         tensordict["gates"] = (gates @ self.shares.unsqueeze(-1)).squeeze(-1)
         composite = self.distribution_class(*parts["primitives"](state), tensordict["gates"])
         tensordict["action"] = composite.deterministic_sample
@@ -86,15 +87,17 @@ class GatesInARow(TensorDictModuleBase):
     def _advance(self) -> None:
         """Begin episodes with the first act, move on where an act is over, and fade."""
         began = self.env.episode["elapsed_steps"].flatten() == 0
-        over = torch.stack([act.until(self.env) for act in self.acts])[self.act, torch.arange(len(self.act))]
+        never = torch.zeros_like(began)
+        over = torch.stack([act.until(self.env) if act.until else never for act in self.acts])
+        over = over[self.act, torch.arange(len(self.act))]
         self.act = torch.where(began, 0, (self.act + over.long()).clamp(max=len(self.acts) - 1))
         wanted = nn.functional.one_hot(self.act, len(self.acts)).float()
         faded = self.shares + (wanted - self.shares).clamp(-self.rate, self.rate)
         self.shares = torch.where(began.unsqueeze(-1), wanted, faded / faded.sum(-1, keepdim=True))
 
-    def _gates(self, act: Act, state: Tensor) -> Tensor:
-        goal = act.parts["goal_normaliser"](act.goal(self.env).to(state.dtype))
-        return self.activation(act.parts["gating"](state, goal))
+    def _gates(self, act: Act, state: Tensor, goal: Tensor) -> Tensor:
+        seen = goal if act.goal is None else act.goal(self.env).to(state.dtype)
+        return self.activation(act.parts["gating"](state, act.parts["goal_normaliser"](seen)))
 
 
 def _require_same(acts: Sequence[Act]) -> None:
