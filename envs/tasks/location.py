@@ -108,7 +108,7 @@ class Location(PDCharacterEnv):
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, the place as it sees it, and metrics."""
-        seen = [logarithmic(_turned(self._offset()[ids], -self.heading(ids)))]
+        seen = [place_seen(self, self.episode["target"], ids)]
         if self.faces:
             angle = self.episode["final_direction"][ids] - self.heading(ids)
             seen.append(steps(torch.ones_like(angle), angle))
@@ -185,6 +185,21 @@ class Location(PDCharacterEnv):
         """Cosine of the angle between heading and direction to face, 1 if any will do, ``(n,)``."""
         angle = self.episode["final_direction"][ids] - self.heading(ids)
         return angle.cos() if self.faces else torch.ones_like(angle)
+
+
+def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
+    """The goal of :class:`Location`, in the environment of any task.
+
+    Args:
+        env: The environment.
+        place: Places on the ground, ``(N, 2)``, in metres.
+        ids: Simulations, ``(n,)``.
+
+    Returns:
+        Each place relative to the centre of mass in the character's heading frame, with a logarithmic distance,
+        ``(n, 2)``.
+    """
+    return logarithmic(_turned((place - env.com[:, :2])[ids], -env.heading(ids)))
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -55,17 +55,13 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     r"""Reward of the location task: go to a place, and stand there.
 
     .. math::
-        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 e) \\
-        e &= \begin{cases}
-            (\hat{u} \cdot v_{com} - \hat{v})^2 & \|x\| > \hat{v} \cdot 1 \text{ s} \\
-            \|v_{com} - x / 1 \text{ s}\|^2 & \text{nearer} \\
-            \|v_{com}\|^2 & \|x\| < 0.3 \text{ m} \end{cases}
+        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 \|v_{com} - v^*\|^2) \\
+        v^* &= \frac{x}{\|x\|} \min(\hat{v}, \|x\| / 1 \text{ s}) \text{, and 0 for } \|x\| < 0.3 \text{ m}
 
-    The second term guides the character from any distance, where the first is flat. Far away it is the paper's heading
-    reward in the direction of the place, :math:`\hat{u} = x / \|x\|`, which is blind to motion across and so rewards a
-    character that has not turned yet. In the last second it asks for a velocity that falls with the distance, and at
-    the place for standing still; there motion across counts, because a character that circles never arrives. The
-    direction to face is a factor of the first term, so that it matters only at the place.
+    The second term guides the character from any distance, where the first is flat. In the last metre it asks for a
+    velocity that falls with the distance, and at the place for standing still. Motion across counts, because a
+    character that circles never arrives. The direction to face is a factor of the first term, so that it matters only
+    at the place.
 
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
@@ -77,11 +73,10 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     Returns:
         Reward, shape ``(*B)``.
     """
-    distance = torch.linalg.vector_norm(offset, dim=-1)
-    far = heading_reward(velocity, torch.nn.functional.normalize(offset, dim=-1), speed)
-    near = velocity_reward(velocity, offset * (distance >= ARRIVAL_DISTANCE).unsqueeze(-1))
-    at_place = (-distance.square()).exp() * (1 + alignment) / 2
-    return 0.4 * at_place + 0.6 * torch.where(distance > speed, far, near)
+    distance = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    wanted = distance.clamp(max=speed) * (distance >= ARRIVAL_DISTANCE)
+    towards = velocity_reward(velocity, torch.nn.functional.normalize(offset, dim=-1) * wanted)
+    return 0.4 * (-distance.squeeze(-1).square()).exp() * (1 + alignment) / 2 + 0.6 * towards
 
 
 def holdout_reward(

@@ -15,6 +15,8 @@ pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as
 from playwright import sync_api as playwright
 
 from torchrl_mcp.envs import Dribble
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.web import play_in_browser
 
@@ -40,10 +42,10 @@ class Stop(Exception):
 
 
 class Show(Player):
-    """A character that holds still, until told to stop."""
+    """A player that stops when told to."""
 
-    def __init__(self, task, **settings):
-        super().__init__(GATED, task("biped", 1, seed=0, num_threads=1, terminate_on_fall=False, **settings))
+    def __init__(self, policy, env):
+        super().__init__(policy, env)
         self.over, self.steps, self.pushed = False, 0, 0.0
 
     def step(self):
@@ -132,7 +134,8 @@ def stands_still(player, page):
 
 
 def test_what_is_done_in_the_browser_reaches_the_player(visit):
-    player = Show(Dribble, max_episode_steps=10**6)
+    still = Dribble("biped", 1, seed=0, num_threads=1, terminate_on_fall=False, max_episode_steps=10**6)
+    player = Show(GATED, still)
     page, state = visit(player), player.env.simulation.state
 
     before = target(player).clone()  # a click on the ground places the target
@@ -163,3 +166,40 @@ def test_what_is_done_in_the_browser_reaches_the_player(visit):
     move(page, WIDTH / 2, HEIGHT - 80)
     hold(page, " ", lambda: stands_still(player, page))
     hold(page, "Backspace", lambda: state["time"][0] == 0.0)
+
+
+def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_and_a_stop(visit):
+    _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, curriculum=None)
+    player = Show(agent.actor.policy, env)
+    page = visit(player)
+    place = env.episode["target"][0]
+
+    def click(x, y):
+        before = place.clone()
+        move(page, x, y)
+        page.mouse.down()
+        page.wait_for_timeout(2 * LONG)
+        page.mouse.up()
+        wait(lambda: (place != before).any(), page)
+
+    def away():
+        return float(torch.linalg.vector_norm(env.com[0, :2] - place))
+
+    def speed():
+        return float(torch.linalg.vector_norm(env.simulation.state["qvel"][0, :2]))
+
+    click(WIDTH - 60, HEIGHT - 80)
+    first = away()
+    wait(lambda: away() < first - 0.3, page)
+    click(60, HEIGHT - 80)  # while it walks
+    wait(lambda: env.episode["success"][0], page)
+    page.wait_for_timeout(3000)
+    assert away() < 0.5
+    assert speed() < 0.3
+    click(WIDTH - 60, HEIGHT - 80)
+    far = away()
+    wait(lambda: away() < far - 0.3, page)
+    move(page, WIDTH / 2, HEIGHT - 80)
+    hold(page, " ", lambda: away() < 0.3)  # where it is
+    wait(lambda: speed() < 0.1, page)
+    assert not player.began

@@ -92,17 +92,57 @@ def test_a_target_is_where_it_is_put(task):
     np.testing.assert_allclose(root + turned @ away, [1.5, -2.5], atol=1e-5)
 
 
+def test_a_character_is_sent_to_a_place_and_stops_where_it_is():
+    steering = idle(Location, target_intervals=(0.1, 0.1))
+    env = steering.player.env
+    steering.put((1.5, -2.5, 0.0))
+    for _ in range(5):
+        steering.step()  # the task would draw places
+    assert env.episode["target"][0].tolist() == [1.5, -2.5]
+    steering.stop()
+    here = env.com[0, :2].tolist()
+    steering.step()
+    assert env.episode["target"][0].tolist() == here
+    steering.let_go()
+    steering.step()
+    assert env.episode["target"][0].tolist() != here
+
+
+def test_a_speed_stays_in_the_range_of_the_task_and_changes_no_more():
+    steering = idle(Heading, speed=(0.0, 1.5), speed_interval=0.03)
+    for change, expected in ((10.0, 1.5), (-0.25, 1.25), (-10.0, 0.0)):
+        steering.accelerate(change)
+        for _ in range(3):
+            steering.step()
+            assert float(steering.player.state["goal"][0, 2]) == expected
+    steering.up()
+    assert steering.target_speed == 0.25
+    steering.stop()
+    assert steering.target_speed == 0.0
+
+
+def test_with_a_goal_of_the_users_an_episode_has_no_time_limit():
+    steering = idle(Heading, max_episode_steps=3, terminate_on_fall=False)
+    steering.aim(0.0)
+    began = [steering.step() or steering.player.began for _ in range(6)]
+    assert not any(began)
+    steering.let_go()
+    steering.step()
+    assert steering.player.began
+
+
 def test_of_a_task_without_it_nothing_is_turned_or_put():
     steering, ball, walk = idle(Heading), idle(Dribble), idle(Location)
-    assert (walk.has_direction, walk.has_place) == (False, False)
-    assert (steering.has_direction, steering.has_place) == (True, False)
-    assert (ball.has_direction, ball.has_place) == (False, True)
+    assert (walk.has_direction, walk.has_speed, walk.has_place, walk.can_stop) == (False, False, True, True)
+    assert (steering.has_direction, steering.has_speed, steering.has_place) == (True, False, False)
+    assert (ball.has_direction, ball.has_place, ball.can_stop) == (False, True, False)
     steering.put((1.0, 1.0))
-    ball.turn(1.0)
-    walk.put((1.0, 1.0))
-    walk.turn(1.0)
-    walk.step()
-    assert steering.place is ball.direction is walk.place is walk.direction is None
+    steering.accelerate(1.0)
+    for other in (ball, walk):
+        other.turn(1.0)
+        other.stop()
+        other.step()
+    assert steering.place is steering.speed is ball.direction is ball.place is walk.direction is None
 
 
 def momentum(player):

@@ -15,8 +15,6 @@ Command = Callable[[Steering], None]
 WIDTH, HEIGHT = 160.0, 14.0
 """Size of a bar in pixels."""
 
-KEYS = "drag a body: push\nspace: pause   - =: slower, faster\nup, down: one primitive alone"
-
 
 def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], None]) -> None:
     """Draw the panel for a frame.
@@ -34,6 +32,8 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
         if turned:
             send(lambda steering: steering.aim(angle))
         imgui.TextDisabled("left, right: turn by 15 degrees")
+    if steering.has_speed:
+        imgui.TextDisabled(f"up, down: speed, now {steering.target_speed:.2f} m/s")
     if steering.has_place:
         imgui.TextDisabled("click on the ground: place the target")
     if weights is not None:
@@ -43,7 +43,9 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
     imgui.SameLine()
     if imgui.Button("let go"):
         send(Steering.let_go)
-    imgui.TextDisabled(KEYS)
+    imgui.TextDisabled(f"drag a body: push\nspace: {'stop' if steering.can_stop else 'pause'}   - =: slower, faster")
+    if not steering.has_speed:
+        imgui.TextDisabled("up, down: one primitive alone")
     imgui.End()
 
 

@@ -1,36 +1,45 @@
 """Interactive control of a playing policy: its goal, the gates of its primitives, and pushes."""
 
 import math
+import sys
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.envs import Carry, Dribble, Heading, Location
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
 """Angle by which a key turns the target direction, in radians."""
 
+SPEED_STEP = 0.25
+"""Change of the target speed by a key, in m/s."""
+
 
 class Steering:
     """A user's control of a playing policy, which viewers call on input from keys, sliders and the mouse.
 
-    Settings persist over episodes, until :meth:`let_go`. A goal or a push takes effect in the next step.
+    Settings persist over episodes, until :meth:`let_go`; with a goal of the user's, episodes have no time limit. A goal
+    or a push takes effect in the next step.
 
     Args:
         player: The player to steer.
 
     Attributes:
         direction: The user's target direction of heading, in radians from the world's x axis, or None for the task's.
-        place: The user's target position of an object, x and y in metres, or None for the task's.
+        speed: The user's target speed of heading, in m/s, or None for the task's.
+        place: The user's target position of the character or an object, x and y in metres, or None for the task's.
     """
 
     def __init__(self, player: Player) -> None:
         self.player = player
         self.direction: float | None = None
+        self.speed: float | None = None
         self.place: tuple[float, float] | None = None
-        self._max_turn = player.env.max_turn if isinstance(player.env, Heading) else 0.0
+        env = player.env
+        self._changes = (env.max_turn, env.change_probability) if isinstance(env, Heading) else (0.0, 0.0)
+        self._time_limit = env.max_episode_steps
 
     @property
     def has_direction(self) -> bool:
@@ -38,14 +47,24 @@ class Steering:
         return isinstance(self.player.env, Heading)
 
     @property
+    def has_speed(self) -> bool:
+        """Whether the task has a speed to change."""
+        return isinstance(self.player.env, Heading) and self.player.env.changes_speed
+
+    @property
     def has_place(self) -> bool:
         """Whether the task has a target to place."""
-        return isinstance(self.player.env, Carry | Dribble)
+        return isinstance(self.player.env, Carry | Dribble | Location)
 
     @property
     def target_direction(self) -> float:
         """Current target direction of heading, the user's or the task's, in radians from -pi to pi."""
         return _wrapped(float(self.player.env.episode["direction"][0]) if self.direction is None else self.direction)
+
+    @property
+    def target_speed(self) -> float:
+        """Current target speed of heading, the user's or the task's, in m/s."""
+        return float(self.player.env.episode["speed"][0]) if self.speed is None else self.speed
 
     def aim(self, direction: float) -> None:
         """Set the target direction of heading, in radians from the world's x axis; it no longer wanders."""
@@ -57,8 +76,37 @@ class Steering:
         if self.has_direction:
             self.aim(self.target_direction + angle)
 
+    def walk(self, speed: float) -> None:
+        """Set the target speed of heading in m/s, within the task's range; it no longer changes."""
+        if isinstance(self.player.env, Heading) and self.has_speed:
+            low, high = self.player.env.speeds
+            self.speed, self.player.env.change_probability = min(max(speed, low), high), 0.0
+
+    def accelerate(self, change: float) -> None:
+        """Change the target speed of heading, in m/s."""
+        if self.has_speed:
+            self.walk(self.target_speed + change)
+
+    def up(self, sign: int = 1) -> None:
+        """Walk faster, or slower with a sign of -1. Without a speed, the previous or next primitive acts alone."""
+        if self.has_speed:
+            self.accelerate(sign * SPEED_STEP)
+        else:
+            self.play_next_alone(-sign)
+
+    @property
+    def can_stop(self) -> bool:
+        """Whether the character can be told to stand."""
+        return self.has_speed or isinstance(self.player.env, Location)
+
+    def stop(self) -> None:
+        """Let the character stand: where it is, or at the lowest of the task's speeds."""
+        self.walk(0.0)
+        if isinstance(self.player.env, Location):
+            self.put(self.player.env.com[0, :2].tolist())
+
     def put(self, place: Sequence[float] | np.ndarray) -> None:
-        """Place the target of the ball or the box on the ground, x and y in metres."""
+        """Place the target of the character, the ball or the box on the ground, x and y in metres."""
         if self.has_place:
             self.place = float(place[0]), float(place[1])
 
@@ -99,18 +147,27 @@ class Steering:
 
     def let_go(self) -> None:
         """Return control of goal and gates to task and policy."""
-        self.direction = self.place = None
+        if self.place is not None and isinstance(self.player.env, Location):
+            self.player.env.episode["seconds_left"][0] = 0.0  # the task draws another
+        self.direction = self.speed = self.place = None
         self.player.pinned = {}
+        self.player.env.max_episode_steps = self._time_limit
         if isinstance(self.player.env, Heading):
-            self.player.env.max_turn = self._max_turn
+            self.player.env.max_turn, self.player.env.change_probability = self._changes
 
     def step(self) -> None:
         """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
-        if self.direction is not None:
-            env.episode["direction"][0] = self.direction
-        if self.place is not None:
+        held = {"direction": self.direction, "speed": self.speed}
+        if self.place is not None and isinstance(env, Location):
+            held |= {"target": self.place, "seconds_left": math.inf}
+        elif self.place is not None:
             env.simulation.state["mocap_pos"][0, 0, :2] = torch.tensor(self.place)
+        for name, value in held.items():
+            if value is not None:
+                env.episode[name][0] = torch.as_tensor(value, dtype=torch.float64)
+        if any(goal is not None for goal in (self.direction, self.speed, self.place)):
+            env.max_episode_steps = sys.maxsize
         self.player.step()
 
 

@@ -25,8 +25,8 @@ HORIZON, ZENITH = (0.45, 0.78, 1.0, 1.0), (0.25, 0.55, 1.0, 1.0)
 KEYS: dict[imgui.Key, Command] = {
     imgui.Key.LeftArrow: lambda steering: steering.turn(TURN),
     imgui.Key.RightArrow: lambda steering: steering.turn(-TURN),
-    imgui.Key.UpArrow: lambda steering: steering.play_next_alone(-1),
-    imgui.Key.DownArrow: lambda steering: steering.play_next_alone(1),
+    imgui.Key.UpArrow: lambda steering: steering.up(),
+    imgui.Key.DownArrow: lambda steering: steering.up(-1),
 }
 """Commands of the arrow keys."""
 
@@ -72,12 +72,14 @@ class StudioApp(viewer_app.ViewerApp):
         self.ux_state.camera_index = ux.set_camera(self.model, camera, following)
 
     def handle_keyboard_events(self) -> None:
-        """Steer with the arrow keys; Studio handles the other keys."""
-        if not imgui.GetIO().WantCaptureKeyboard:
-            for key, command in KEYS.items():
-                if imgui.IsKeyPressed(key, False):  # without repeats
-                    self._send(command)
-        super().handle_keyboard_events()
+        """Steer with the arrow keys, and stop with Space where a task can; Studio handles the other keys."""
+        keys = KEYS | ({imgui.Key.Space: Steering.stop} if self._steering.can_stop else {})
+        pressed = [key for key in keys if imgui.IsKeyPressed(key, False)]  # without repeats
+        if pressed and not imgui.GetIO().WantCaptureKeyboard:
+            for key in pressed:
+                self._send(keys[key])
+        else:
+            super().handle_keyboard_events()
 
     def handle_mouse_events(self) -> None:
         """Drag bodies and place the target; Studio handles the rest."""

@@ -40,11 +40,11 @@ class Keyboard:
         self._commands: dict[int, Callable[[], None]] = {
             263: lambda: steering.turn(TURN),  # GLFW's left arrow
             262: lambda: steering.turn(-TURN),  # right
-            265: lambda: steering.play_next_alone(-1),  # up
-            264: lambda: steering.play_next_alone(1),  # down
+            265: steering.up,
+            264: lambda: steering.up(-1),  # down
             259: steering.reset,  # backspace
             257: steering.let_go,  # enter
-            ord(" "): self._pause,
+            ord(" "): steering.stop if steering.can_stop else self._pause,
             ord("-"): lambda: self._pace(SLOWER),
             ord("="): lambda: self._pace(1 / SLOWER),
         }

@@ -33,11 +33,11 @@ def vector(*numbers):
         ((0.0, 0.0), (0.2, 0.0), 1.0, 0.4 * math.exp(-0.04) + 0.6),
         ((0.0, 1.0), (0.0, 8.0), 1.0, 0.6 + 0.4 * math.exp(-64)),
         ((0.0, 0.0), (0.0, 8.0), 1.0, 0.6 * math.exp(-4)),
-        ((1.0, 0.5), (8.0, 0.0), 1.0, 0.6),  # far away, only the speed towards the place counts
-        ((0.6, 0.5), (0.6, 0.0), 1.0, 0.4 * math.exp(-0.36) + 0.6 * math.exp(-1)),  # in the last metre, all motion
+        ((1.0, 0.5), (8.0, 0.0), 1.0, 0.6 * math.exp(-1)),  # motion across counts
+        ((0.6, 0.5), (0.6, 0.0), 1.0, 0.4 * math.exp(-0.36) + 0.6 * math.exp(-1)),  # in the last metre
         ((0.0, -0.8), (0.0, -0.8), 1.0, 0.4 * math.exp(-0.64) + 0.6),  # and the speed falls
         ((0.0, 0.0), (0.5, 0.0), 1.0, 0.4 * math.exp(-0.25) + 0.6 * math.exp(-1)),
-        ((0.0, 0.5), (0.1, 0.0), 1.0, 0.4 * math.exp(-0.01) + 0.6 * math.exp(-1)),  # at the place, all motion counts
+        ((0.0, 0.5), (0.1, 0.0), 1.0, 0.4 * math.exp(-0.01) + 0.6 * math.exp(-1)),  # at the place, standing still
         ((0.0, 0.0), (0.0, 0.0), -1.0, 0.6),  # at the place, back to front
         ((0.0, 0.0), (0.0, 0.0), 0.0, 0.8),
     ],
@@ -58,7 +58,7 @@ def test_the_reward_of_a_step_is_for_the_displacement_of_the_centre_of_mass_and_
     after = env.step(start)["next"]
     velocity, offset = (_centre(env) - before) * 30, np.array([2.0, 1.0]) - _centre(env)
     aim = offset / np.linalg.norm(offset)
-    expected = 0.4 * math.exp(-(offset @ offset)) + 0.6 * math.exp(-4 * (velocity @ aim - 1) ** 2)
+    expected = 0.4 * math.exp(-(offset @ offset)) + 0.6 * math.exp(-4 * np.sum((velocity - aim) ** 2))
     assert after["reward"][0].item() == pytest.approx(expected, rel=1e-9)
     assert not torch.equal(env.episode["target"][0], vector(2.0, 1.0))  # drawn after the reward
 
