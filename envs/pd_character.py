@@ -15,6 +15,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
 from torchrl_mcp.envs.characters.kinematics import BodyStates, origin_velocities
 from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_state
+from torchrl_mcp.envs.characters.stance import rest_controls
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.observations import character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
@@ -119,6 +120,7 @@ class PDCharacterEnv(CharacterEnv):
         self.terminate_on_fall = terminate_on_fall
         self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5]).to(self.device)
         self._rest = torch.from_numpy(model.qpos0).to(self.device)
+        self._centre = torch.from_numpy(rest_controls(model)).to(self.device)
         shapes = falling_geoms(model, self.character.feet, len(self._bodies))
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
@@ -145,9 +147,9 @@ class PDCharacterEnv(CharacterEnv):
     def mirrors(self) -> dict[str, Mirror]:
         """See :meth:`CharacterEnv.mirrors`."""
         return {
-            "observation": mirror_state(self._bodies),
+            "observation": mirror_state(self._bodies, sides=self.character.sides),
             "goal": self.goal_mirror(),
-            "action": mirror_actions(self.simulation.model),
+            "action": mirror_actions(self.simulation.model, sides=self.character.sides),
         }
 
     def goal_mirror(self) -> Mirror:
@@ -223,7 +225,7 @@ class PDCharacterEnv(CharacterEnv):
         return torch.tensor([-1.0, 1.0]).expand(self.simulation.model.nu, 2)
 
     def _controls(self, action: Tensor) -> Tensor:
-        return action * self._scale
+        return self._centre + action * self._scale
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """Return the scene at rest, with the first episodes shortened if the curriculum says so."""

@@ -1,8 +1,10 @@
 import os
+import runpy
 import sys
 import traceback
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from importlib import import_module
+from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -12,6 +14,8 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
+
+from torchrl_mcp.envs.characters import CHARACTERS
 
 # Small tensors: a thread pool costs more than it gives, and results must not depend on the machine's cores.
 torch.set_num_threads(1)
@@ -52,6 +56,39 @@ def command():
         return CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 
     return call
+
+
+@pytest.fixture(scope="session")
+def robot_file():
+    """Find a robot's file of the package mjlab, which is no part of the project, without importing that."""
+
+    def find(name) -> Path:
+        found = find_spec("mjlab")
+        if found is None:
+            pytest.skip("needs robots' files: pip install --no-deps mjlab==1.6.0")
+        return Path(found.origin).parent / "asset_zoo" / "robots" / f"unitree_{name}" / "xmls" / f"{name}.xml"
+
+    return find
+
+
+@pytest.fixture(scope="module")
+def robot(robot_file, command, tmp_path_factory):
+    """Adapt a robot by one command, and register it until the module's tests end; return what the command printed."""
+    folder, names = tmp_path_factory.mktemp("robots"), []
+
+    def adapt(name, *options):
+        if name not in CHARACTERS:
+            done = command("character", "adapt", robot_file(name), "--name", name, *options, cwd=folder)
+            assert done.returncode == 0, done.stderr
+            runpy.run_path(str(folder / f"{name}.py"))
+            names.append(name)
+            outputs[name] = done.stdout
+        return outputs[name]
+
+    outputs: dict[str, str] = {}
+    yield adapt
+    for name in names:
+        del CHARACTERS[name]
 
 
 def _exit_code(main):

@@ -1,96 +1,173 @@
-"""The tutorial on a character from a file, command by command, with the smallest budgets."""
+"""A body from a file becomes a character that trains: Gymnasium's humanoid, and the tutorial on robots, in small."""
 
-import contextlib
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
-from torchrl_mcp.cli import character, play, train
+from torchrl_mcp.cli import character, motions, play, train
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.rendering import opengl
 
+HUMANOID = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "humanoid.xml"
 TUTORIAL = (Path(__file__).parents[1] / "docs" / "tutorials" / "character.md").read_text()
-PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-COMMAND = re.compile(r"^(torchrl-mcp-\w+) (.*)$", re.MULTILINE)
-PROGRAMS = {f"torchrl-mcp-{module.__name__.rpartition('.')[2]}": module for module in (character, play, train)}
+STEP = re.compile(r"^```python\n(?P<code>.*?)^```$|^(?P<line>torchrl-mcp-\w+ [^\n]*)$", re.DOTALL | re.MULTILINE)
+GYMNAST = """
+torchrl-mcp-character check humanoid.xml
+torchrl-mcp-character adapt humanoid.xml --name gymnast --pose knee=-0.035
+torchrl-mcp-character check gymnast.xml
+torchrl-mcp-train --config-dir own task=heading character=gymnast method=scratch run_dir=runs/gymnast
+torchrl-mcp-play --trust gymnast runs/gymnast --output walk.gif
+"""
+MODULES = (character, motions, play, train)
+PROGRAMS = {f"torchrl-mcp-{module.__name__.rpartition('.')[2]}": module for module in MODULES}
+TRAINING = (
+    "preset=smoke logger=none num_threads=1 torch_threads=1 progress_bar=false training.total_frames=128 "
+    "hydra/job_logging=none hydra/hydra_logging=none"
+)
 SMALLER = {
-    "torchrl-mcp-train": "preset=smoke logger=none num_threads=1 torch_threads=1 progress_bar=false "
-    "training.total_frames=128 hydra/job_logging=none hydra/hydra_logging=none",
+    "torchrl-mcp-train": TRAINING,
     "torchrl-mcp-play": "--seconds 0.2 --width 64 --height 48",
+    "torchrl-mcp-motions": "--rate 10",
 }
 
 
-@pytest.fixture(scope="module")
-def called(tmp_path_factory):
-    """How each command of the tutorial ended, in a folder that is its working directory."""
-    folder, outcomes = tmp_path_factory.mktemp("tutorial"), []
+def follow(text, folder, names):
+    """Run the Python and the commands of a text in a folder; return each command with its status."""
+    outcomes, namespace = [], {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         path = list(sys.path)
-        for code in PYTHON.findall(TUTORIAL):
-            exec(compile(code, "character.md", "exec"), {})
-        for program, arguments in COMMAND.findall(TUTORIAL):
-            if program == "torchrl-mcp-play" and opengl._platform() is None:
+        for step in STEP.finditer(text):
+            if code := step["code"]:
+                exec(compile(code, "tutorial", "exec"), namespace)
                 continue
-            forget()  # each command has a process of its own
+            program, _, arguments = step["line"].partition(" ")
+            if (program == "torchrl-mcp-play" or " render " in step["line"]) and opengl._platform() is None:
+                continue
+            forget(names)  # each command has a process of its own
             patch.setattr(sys, "path", list(path))
-            patch.setattr(sys, "argv", shlex.split(f"{program} {arguments} {SMALLER.get(program, '')}"))
+            smaller = "--seconds 0.2" if " render " in step["line"] else SMALLER.get(program, "")
+            patch.setattr(sys, "argv", shlex.split(f"{step['line']} {smaller}"))
             try:
                 PROGRAMS[program].main()
-                code = 0
+                status = 0
             except SystemExit as stop:
-                code = stop.code
-            outcomes.append((f"{program} {arguments}", code))
-        yield folder, outcomes
-    forget()
+                status = stop.code
+            outcomes.append((f"{program} {arguments}", status))
+    return outcomes
 
 
-def forget():
-    """Remove the tutorial's module and character from this process."""
-    sys.modules.pop("gymnast", None)
-    CHARACTERS.pop("gymnast", None)
+def forget(names):
+    """Remove modules and characters from this process."""
+    for name in names:
+        sys.modules.pop(name, None)
+        CHARACTERS.pop(name, None)
 
 
-def test_only_the_first_check_finds_something(called):
-    _, [(first, code), *others] = called
-    assert (first, code) == ("torchrl-mcp-character check humanoid.xml", 1)
-    assert [(line, code) for line, code in others if code] == []
-    assert {line.split()[0] for line, _ in others} >= {"torchrl-mcp-character", "torchrl-mcp-train"}
+@pytest.fixture(scope="module")
+def gymnast(tmp_path_factory):
+    """How each command with Gymnasium's humanoid ended, in a folder that is its working directory."""
+    folder = tmp_path_factory.mktemp("gymnast")
+    shutil.copy(HUMANOID, folder / "humanoid.xml")
+    yield folder, follow(GYMNAST, folder, ["gymnast"])
+    forget(["gymnast"])
 
 
-def test_the_folder_holds_what_the_tutorial_names(called):
-    folder, _ = called
+@pytest.fixture(scope="module")
+def robots(robot_file, tmp_path_factory):
+    """How each command of the tutorial ended."""
+    robot_file("go1")
+    folder = tmp_path_factory.mktemp("tutorial")
+    yield folder, follow(TUTORIAL, folder, ["go1", "g1"])
+    forget(["go1", "g1"])
+
+
+def test_gymnasiums_humanoid_trains_although_it_cannot_hold_its_rest_pose(gymnast):
+    folder, outcomes = gymnast
+    assert [status for _, status in outcomes] == [1, 1, 1, 0, 0][: len(outcomes)]  # it has no ankles to balance with
     for name in ("gymnast.xml", "gymnast.py", "own/character/gymnast.yaml", "runs/gymnast/metrics.csv"):
         assert (folder / name).is_file()
     assert CHARACTERS["gymnast"].feet == ("right_foot", "left_foot")
 
 
-def test_adapting_again_overwrites_nothing_and_says_what_to_do(called, monkeypatch):
-    folder, _ = called
+def test_every_command_of_the_tutorial_succeeds(robots):
+    _, outcomes = robots
+    assert [(line, status) for line, status in outcomes if status] == []
+    assert {line.split()[0] for line, _ in outcomes} >= {"torchrl-mcp-character", "torchrl-mcp-motions"}
+
+
+def test_the_folder_holds_what_the_tutorial_names(robots):
+    folder, _ = robots
+    for name in ("go1.xml", "go1.py", "own/character/go1.yaml", "runs/go1/metrics.csv", "runs/g1_heading/metrics.csv"):
+        assert (folder / name).is_file()
+    assert MotionClip.load(folder / "g1_walks" / "walk_1.npz").character == "g1"
+
+
+def test_the_table_of_the_tutorial_is_the_commands(robots, command, tmp_path):
+    folder, _ = robots
+    done = command(
+        "character",
+        "adapt",
+        folder / "robots" / "go1.xml",
+        *["--name", "dog", "--pose", "thigh=0.9", "calf=-1.8"],
+        cwd=tmp_path,
+    )
+    (row,) = re.findall(r"^FR_calf .*$", TUTORIAL, re.MULTILINE)
+    assert row.split() in [line.split() for line in done.stdout.splitlines()]
+
+
+def test_adapting_again_overwrites_nothing_and_says_what_to_do(gymnast, command):
+    folder, _ = gymnast
     before = {path: path.read_bytes() for path in folder.glob("*.*")}
-    for source, name in (("humanoid.xml", "gymnast"), ("humanoid.xml", "humanoid")):
-        arguments = ["torchrl-mcp-character", "adapt", str(folder / source), "--name", name, "--output", str(folder)]
-        monkeypatch.setattr(sys, "argv", arguments)
-        with pytest.raises(SystemExit, match=f"{name}.xml is there already: pass another --name or --output"):
-            character.main()
+    for name in ("gymnast", "humanoid"):
+        arguments = ("humanoid.xml", "--pose", "knee=-0.035", "--name", name)
+        done = command("character", "adapt", *arguments, cwd=folder)
+        assert f"{name}.xml is there already: pass another --name or --output" in done.stderr
     assert before == {path: path.read_bytes() for path in folder.glob("*.*")}
 
 
-def test_the_next_commands_begin_in_the_folder_of_the_files(called, tmp_path, monkeypatch, capsys):
-    folder, _ = called
-    monkeypatch.chdir(tmp_path)
-    arguments = ["adapt", str(folder / "humanoid.xml"), "--name", "athlete", "--output", "bodies"]
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-character", *arguments])
-    with contextlib.suppress(SystemExit):
-        character.main()
-    assert "Next:\n  cd bodies\n  torchrl-mcp-play" in capsys.readouterr().out
+def test_the_next_commands_begin_in_the_folder_of_the_files(gymnast, command, tmp_path):
+    folder, _ = gymnast
+    arguments = (folder / "humanoid.xml", "--pose", "knee=-0.035", "--name", "athlete", "--output", "bodies")
+    done = command("character", "adapt", *arguments, cwd=tmp_path)
+    assert "Next:\n  cd bodies\n  torchrl-mcp-play" in done.stdout
     assert (tmp_path / "bodies" / "own" / "character" / "athlete.yaml").is_file()
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--torque knee", "'knee' is not of the form PATTERN=NUMBER, such as ankle=50"),
+        ("--torque knee=-3", "'knee=-3' is not of the form PATTERN=NUMBER"),
+        ("--gain (=5", "'(=5' is not of the form PATTERN=NUMBER"),
+        ("--sides left", "'left' is not of the form RIGHT:LEFT, such as FR_:FL_"),
+        ("--pose crouch", "--pose crouch is no keyframe of the file: its keyframes are 0, 1"),
+        ("--gain ankle=5", "--gain ankle=5 matches no joint: they are lwaist, pelvis, right_thigh"),
+        ("--root head", "there is no body head for the root: name one of torso, lwaist"),
+    ],
+)
+def test_what_is_wrong_with_an_option_is_said_in_a_sentence(command, tmp_path, options, message):
+    options = options if "--pose" in options else f"{options} --pose knee=-0.035"
+    done = command("character", "adapt", HUMANOID, "--name", "gymnast", *options.split(), cwd=tmp_path)
+    assert done.returncode
+    assert message in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_units_other_than_metres_are_pointed_out(command, tmp_path):
+    text = HUMANOID.read_text().replace("<option ", '<option gravity="0 0 -981" ')
+    (tmp_path / "giant.xml").write_text(text)
+    done = command("character", "adapt", "giant.xml", "--name", "titan", "--pose", "knee=-0.035", cwd=tmp_path)
+    assert "units: gravity is 981 in the file, so its lengths are not in metres" in done.stdout
+
+
 @pytest.mark.skipif(opengl._platform() is None, reason="no OpenGL to draw with")
-def test_it_ends_with_a_film(called):
-    folder, _ = called
-    assert all((folder / name).stat().st_size > 1000 for name in ("still.gif", "random.gif", "walk.gif"))
+def test_it_ends_with_a_film(gymnast):
+    folder, _ = gymnast
+    assert (folder / "walk.gif").stat().st_size > 1000

@@ -1,24 +1,21 @@
 """Converting bodies that were made for other purposes into characters."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from torchrl_mcp.envs.characters.contract import BALL, FREE, HINGE, colliding, joints_of, kinds_of, lowest_bodies
-
-TIMESTEP = 1 / 120
-"""Seconds of a physics step."""
-
-LIMIT_ANGLE = 0.4
-"""Distance in radians from its target at which a joint's torque reaches its limit, as at the biped's hip."""
+from torchrl_mcp.envs.characters.drives import TIMESTEP, Drive, drive, load, matched
+from torchrl_mcp.envs.characters.pose import FREE_RANGE, Pose
+from torchrl_mcp.envs.characters.sides import Sides, guessed_sides
 
 BEYOND = 1.2
 """Factor on the limits of a joint that defines the range of its targets."""
 
-DEFAULT_RANGE = (-1.57, 1.57)
-"""Range in radians of a joint without limits."""
+LEAST_INERTIA = 1e-10
+"""Moment of inertia in kg m^2 below which MuJoCo writes 0."""
 
 KINDS = {
     mujoco.mjtGeom.mjGEOM_SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -30,58 +27,128 @@ KINDS = {
 """The shape that replaces each shape."""
 
 
-class Gains(NamedTuple):
-    """Parameters of a joint's drive.
+class Adapted(NamedTuple):
+    """A body that was made a character.
 
     Args:
-        torque: Limit of the torque, in N m.
-        stiffness: Stiffness in N m/rad.
-        damping: Damping in N m s/rad: three quarters in the actuator, a quarter in the joint.
-        armature: Armature in kg m^2, so that a light limb does not chatter between the limits of the torque.
+        spec: The body.
+        root: Name of its root.
+        feet: Bodies that may touch the ground.
+        sides: Beginnings or ends of bodies' names, right and left.
+        drives: Drive of the joint of each body, by name.
+        ranges: Range of each of these joints in radians; of a ball joint its greatest angle.
+        left_out: Other bodies that hang on the world of the file.
     """
 
-    torque: float
-    stiffness: float
-    damping: float
-    armature: float
+    spec: mujoco.MjSpec
+    root: str
+    feet: tuple[str, ...]
+    sides: Sides
+    drives: Mapping[str, Drive]
+    ranges: Mapping[str, tuple[float, float]]
+    left_out: tuple[str, ...]
 
 
-def adapted(model: mujoco.MjModel) -> mujoco.MjSpec:
-    """Return a body that meets the contract of a :class:`~torchrl_mcp.envs.characters.Character`, as far as possible.
+def adapted(
+    model: mujoco.MjModel,
+    *,
+    root: str | None = None,
+    pose: Sequence[str] = (),
+    feet: Sequence[str] | None = None,
+    sides: Sides | None = None,
+    torques: Mapping[str, float] | None = None,
+    gains: Mapping[str, float] | None = None,
+) -> Adapted:
+    """Make a body a :class:`~torchrl_mcp.envs.characters.Character`, as far as possible.
 
-    Floor, lights, cameras, tendons and sensors are left out; cylinders become capsules and ellipsoids boxes. Several
-    hinges of a body become a ball joint, whose targets have the ranges of the hinges about each axis. Motors become
-    position servos with the same torque limits; the limit of a joint without a motor comes from the masses that it
-    moves. The body is put on the ground. Masses and inertias stay the same.
+    Floor, lights, cameras, tendons and sensors are left out, and shapes that do not collide if they are meshes;
+    cylinders become capsules and ellipsoids boxes. Several hinges of a body become a ball joint, whose targets have the
+    ranges of the hinges about each axis. Each joint gets a position servo, see
+    :func:`~torchrl_mcp.envs.characters.drives.drive`. The body is put on the ground. Masses, inertias, ranges of
+    hinges, and damping, stiffness and friction loss of joints stay the same.
 
     Args:
         model: The body in its scene, compiled.
+        root: Body that carries all others, or None for the one with the most bodies. It gets a free joint if it has
+            no joint.
+        pose: Rest pose, see :meth:`~torchrl_mcp.envs.characters.pose.Pose.read`; empty for that of the file.
+        feet: Bodies that may touch the ground, or None for the lowest in the rest pose.
+        sides: Beginnings or ends of bodies' names, right and left, or None for the usual ones that occur.
+        torques: Limits of torques in N m, by regular expressions that are found in names of joints or bodies.
+        gains: Gains in N m/rad, likewise.
 
     Raises:
-        ValueError: If the body has not one root with a free joint, or has a slide joint or a colliding mesh.
+        ValueError: If an argument names what is not there, the body has a slide joint or a colliding mesh, or the rest
+            pose is beyond the limits of a joint or not on feet.
     """
-    _require_convertible(model)
-    spec = mujoco.MjSpec()
+    trunk = _root(model, root)
+    names = {
+        body: model.body(body).name or f"body_{body}" for body in range(1, model.nbody) if trunk in _line(model, body)
+    }
+    _require_convertible(model, names)
+    rest = Pose.read(model, pose, list(names))
+    spec = _standing(model, names, rest)
+    soles = _feet(feet, lowest_bodies(spec.compile())[1], names)
+    jointed = {body: name for body, name in names.items() if body != trunk and joints_of(model, body)}
+    drives = _drives(spec.compile(), model, jointed, soles, torques or {}, gains or {})
+    for body, name in jointed.items():
+        joint, own = spec.joint(name), drives[name]
+        joint.damping[0], joint.stiffness[0] = own.passive, own.spring
+        joint.armature, joint.frictionloss = own.armature, own.friction
+        _add_servos(spec, name, own, _ranges(model, body, rest))
+    return Adapted(
+        spec,
+        names[trunk],
+        soles,
+        guessed_sides(names.values()) if sides is None else sides,
+        drives,
+        {name: (spec.joint(name).range[0], spec.joint(name).range[1]) for name in drives},
+        tuple(model.body(body).name for body in _roots(model) if body not in _line(model, trunk)),
+    )
+
+
+def _standing(model: mujoco.MjModel, names: Mapping[int, str], rest: Pose) -> mujoco.MjSpec:
+    """Build the body in its rest pose on the ground, without servos."""
+    spec, trunk = mujoco.MjSpec(), next(iter(names))
     spec.compiler.degree = False
     spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    bodies = {0: spec.worldbody}
-    for body in range(1, model.nbody):
-        name = model.body(body).name or f"body_{body}"
+    bodies = {model.body_parentid[trunk]: spec.worldbody}
+    for body, name in names.items():
+        place, turn = rest.relative(body, trunk)
         bodies[body] = bodies[model.body_parentid[body]].add_body(
             name=name,
-            pos=model.body_pos[body],
-            quat=model.body_quat[body],
+            pos=place,
+            quat=turn,
             explicitinertial=True,
             mass=model.body_mass[body],
             ipos=model.body_ipos[body],
             iquat=model.body_iquat[body],
-            inertia=model.body_inertia[body],
+            inertia=_possible(model.body_inertia[body]),
         )
-        _add_joint(spec, bodies[body], name, model, body)
+        _add_joint(bodies[body], name, model, body, rest)
         _add_shapes(bodies[body], model, body)
-    lowest, _ = lowest_bodies(spec.compile())
-    spec.bodies[1].pos = spec.bodies[1].pos - [0.0, 0.0, lowest]
+    bodies[trunk].pos = bodies[trunk].pos - [0.0, 0.0, lowest_bodies(spec.compile())[0]]
     return spec
+
+
+def _drives(
+    posed: mujoco.MjModel,
+    model: mujoco.MjModel,
+    jointed: Mapping[int, str],
+    feet: Sequence[str],
+    torques: Mapping[str, float],
+    gains: Mapping[str, float],
+) -> dict[str, Drive]:
+    """Choose the drive of each joint of a body that stands in its rest pose."""
+    known = {
+        body: (*(model.joint(joint).name for joint in joints_of(model, body)), name) for body, name in jointed.items()
+    }
+    torque, gain = matched(torques, known, "--torque"), matched(gains, known, "--gain")
+    soles = [posed.body(foot).id for foot in feet]
+    return {
+        name: drive(model, body, load(posed, posed.body(name).id, soles), torque.get(body), gain.get(body))
+        for body, name in jointed.items()
+    }
 
 
 def key_bodies(model: mujoco.MjModel) -> list[str]:
@@ -90,59 +157,117 @@ def key_bodies(model: mujoco.MjModel) -> list[str]:
     return [model.body(body).name for body in range(2, model.nbody) if body not in parents]
 
 
-def _require_convertible(model: mujoco.MjModel) -> None:
-    roots = np.flatnonzero(model.body_parentid[1:] == 0) + 1
-    if len(roots) != 1 or kinds_of(model, int(roots[0])) != [FREE]:
-        raise ValueError("a character has one root with a free joint and nothing else: give the root a freejoint")
-    for body in range(2, model.nbody):
+def _roots(model: mujoco.MjModel) -> list[int]:
+    """Bodies that hang on the world."""
+    return (np.flatnonzero(model.body_parentid[1:] == 0) + 1).tolist()
+
+
+def _line(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those on which it hangs."""
+    line = [body]
+    while line[-1]:
+        line.append(int(model.body_parentid[line[-1]]))
+    return line
+
+
+def _root(model: mujoco.MjModel, name: str | None) -> int:
+    """Find the root: the body of a name, or the one on the world that carries the most bodies."""
+    every = [model.body(body).name for body in range(1, model.nbody)]
+    if not every:
+        raise ValueError("the file has no body")
+    if name is not None and name not in every:
+        raise ValueError(f"there is no body {name} for the root: name one of {', '.join(filter(None, every))}")
+    if name is not None:
+        return every.index(name) + 1
+    return int(np.bincount(model.body_rootid[1:]).argmax())
+
+
+def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> None:
+    trunk, *others = names
+    if kinds_of(model, trunk) not in ([], [FREE]):
+        raise ValueError(f"the root {names[trunk]} has joints other than a free joint: replace them by a freejoint")
+    for body in others:
         kinds = kinds_of(model, body)
         if any(kind not in (BALL, HINGE) for kind in kinds) or (BALL in kinds and len(kinds) > 1):
-            raise ValueError(f"{model.body(body).name} has a joint that is neither hinge nor ball: replace or weld it")
+            raise ValueError(f"{names[body]} has a joint that is neither hinge nor ball: replace or weld it")
     for geom in colliding(model):
         kind = mujoco.mjtGeom(model.geom_type[geom])
-        if kind not in KINDS:
+        if kind not in KINDS and model.geom_bodyid[geom] in names:
             raise ValueError(f"{model.geom(geom).name or geom} is a {kind.name} that collides: draw capsules or boxes")
 
 
-def _add_joint(spec: mujoco.MjSpec, target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: int) -> None:
-    """Add a body's joint and its actuators."""
+def _possible(inertia: np.ndarray) -> np.ndarray:
+    """Principal moments that stay possible when a file rounds them: none exceeds the sum of the others."""
+    smallest, middle, largest = inertia.argsort()
+    inertia = np.maximum(inertia, LEAST_INERTIA)
+    inertia[smallest] = max(inertia[smallest], 1.0001 * inertia[largest] - inertia[middle])
+    return inertia
+
+
+def _feet(given: Sequence[str] | None, lowest: Sequence[str], names: Mapping[int, str]) -> tuple[str, ...]:
+    every = list(names.values())
+    if given is not None:
+        if unknown := [name for name in given if name not in every]:
+            raise ValueError(f"there is no body {', '.join(unknown)} for the feet: name some of {', '.join(every)}")
+        return tuple(given)
+    if every[0] in lowest:
+        raise ValueError(
+            f"{every[0]}, the root, is lowest in the rest pose: choose one that stands on feet, such as --pose "
+            "KEYFRAME or --pose knee=-1.2, or name the feet (--feet)"
+        )
+    return tuple(lowest)
+
+
+def _add_joint(target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: int, rest: Pose) -> None:
+    """Add a body's joint."""
     joints, kinds = joints_of(model, body), kinds_of(model, body)
-    if kinds == [FREE]:
-        target.add_freejoint(name=name)
+    if not joints or kinds == [FREE]:
+        if target.parent.name == "world":
+            target.add_freejoint(name=name)
         return
-    if not kinds:
-        return
-    gains, place = _gains(model, body), model.jnt_pos[joints].mean(0)
-    shared = {"name": name, "pos": place, "armature": gains.armature, "damping": [gains.damping / 4, 0, 0]}
+    joint = target.add_joint(name=name, pos=model.jnt_pos[joints].mean(0), limited=True)
+    targets = _ranges(model, body, rest)
     if kinds == [HINGE]:
-        low, high = _range(model, joints[0])
-        middle, half = (low + high) / 2, BEYOND * (high - low) / 2
-        target.add_joint(**shared, axis=model.jnt_axis[joints[0]], range=[low, high], limited=True)
-        _add_servo(spec, name, name, gains, (middle - half, middle + half))
+        joint.axis, joint.range, joint.ref = model.jnt_axis[joints[0]], targets[0], rest.angle(joints[0])
+        joint.springref = model.qpos_spring[model.jnt_qposadr[joints[0]]]
         return
-    ranges = _ball_ranges(model, joints) if HINGE in kinds else np.tile([-1, 1], (3, 1)) * _range(model, joints[0])[1]
-    largest = min(float(np.linalg.norm(abs(ranges).max(1))), 3.1)
-    target.add_joint(**shared, type=mujoco.mjtJoint.mjJNT_BALL, range=[0.0, largest], limited=True)
-    for axis, (low, high) in enumerate(ranges):
+    joint.type = mujoco.mjtJoint.mjJNT_BALL
+    joint.range = [0.0, min(float(np.linalg.norm(abs(targets).max(1))), 3.1)]
+
+
+def _ranges(model: mujoco.MjModel, body: int, rest: Pose) -> np.ndarray:
+    """Range of a hinge, ``(1, 2)``, or of rotation about x, y and z, to first order, ``(3, 2)``, in radians."""
+    joints, kinds = joints_of(model, body), kinds_of(model, body)
+    if kinds == [HINGE]:
+        return np.array([rest.range(joints[0])])
+    if kinds == [BALL]:
+        largest = model.jnt_range[joints[0], 1] if model.jnt_limited[joints[0]] else FREE_RANGE
+        return np.tile([-largest, largest], (3, 1))
+    ranges = np.zeros((3, 2))
+    for hinge in joints:
+        ends = np.outer(model.jnt_axis[hinge], np.subtract(rest.range(hinge), rest.angle(hinge)))
+        ranges += np.sort(ends, axis=1)
+    narrow = ranges[:, 1] - ranges[:, 0] < 0.2  # a small range about axes without a hinge
+    ranges[narrow] = [-0.1, 0.1]
+    return ranges
+
+
+def _add_servos(spec: mujoco.MjSpec, name: str, chosen: Drive, ranges: np.ndarray) -> None:
+    """Add the servo of a hinge, or the three of a ball joint."""
+    suffixes = [""] if len(ranges) == 1 else ["_x", "_y", "_z"]
+    for suffix, gear, (low, high) in zip(suffixes, np.eye(6), ranges, strict=False):
         middle, half = (low + high) / 2, BEYOND * (high - low) / 2
-        gear = np.eye(6)[axis]
-        _add_servo(spec, f"{name}_{'xyz'[axis]}", name, gains, (middle - half, middle + half), gear=gear)
-
-
-def _add_servo(
-    spec: mujoco.MjSpec, name: str, joint: str, gains: Gains, targets: tuple[float, float], **kwargs: Sequence[float]
-) -> None:
-    actuator = spec.add_actuator(
-        name=name,
-        target=joint,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        ctrllimited=True,
-        ctrlrange=targets,
-        forcelimited=True,
-        forcerange=[-gains.torque, gains.torque],
-        **kwargs,
-    )
-    actuator.set_to_position(kp=gains.stiffness, kv=0.75 * gains.damping)
+        actuator = spec.add_actuator(
+            name=name + suffix,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gear=gear,
+            ctrllimited=True,
+            ctrlrange=[middle - half, middle + half],
+            forcelimited=True,
+            forcerange=[-chosen.torque, chosen.torque],
+        )
+        actuator.set_to_position(kp=chosen.gain, kv=chosen.damping)
 
 
 def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> None:
@@ -160,57 +285,8 @@ def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> Non
             size=size,
             pos=model.geom_pos[geom],
             quat=model.geom_quat[geom],
-            rgba=model.geom_rgba[geom],
+            rgba=[*model.geom_rgba[geom, :3], 1.0 if collides else model.geom_rgba[geom, 3]],
             friction=model.geom_friction[geom],
             contype=0,
             conaffinity=int(collides),
         )
-
-
-def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
-    """Limits of a joint in radians, widened to contain the rest pose."""
-    low, high = model.jnt_range[joint] if model.jnt_limited[joint] else DEFAULT_RANGE
-    return min(float(low), 0.0), max(float(high), 0.0)
-
-
-def _ball_ranges(model: mujoco.MjModel, hinges: Sequence[int]) -> np.ndarray:
-    """Ranges of rotation about x, y and z for several hinges, to first order, ``(3, 2)`` in radians."""
-    ranges = np.zeros((3, 2))
-    for hinge in hinges:
-        ends = np.outer(model.jnt_axis[hinge], _range(model, hinge))
-        ranges += np.sort(ends, axis=1)
-    narrow = ranges[:, 1] - ranges[:, 0] < 0.2  # a small range about axes without a hinge
-    ranges[narrow] = [-0.1, 0.1]
-    return ranges
-
-
-def _gains(model: mujoco.MjModel, body: int) -> Gains:
-    """Parameters of the drive of a body's joint."""
-    torque = max((_motor_torque(model, joint) for joint in joints_of(model, body)), default=0.0)
-    torque = torque or _torque_of_masses(model, body)
-    stiffness = torque / LIMIT_ANGLE
-    damping = stiffness / 10
-    return Gains(torque, stiffness, damping, armature=TIMESTEP * damping / 8)
-
-
-def _motor_torque(model: mujoco.MjModel, joint: int) -> float:
-    """Largest torque of the actuators of a joint, in N m, 0 if unknown."""
-    torque = 0.0
-    for index in np.flatnonzero((model.actuator_trnid[:, 0] == joint) & (model.actuator_trntype == 0)):
-        force = abs(model.actuator_forcerange[index]).max() if model.actuator_forcelimited[index] else 0.0
-        if not force and model.actuator_ctrllimited[index] and model.actuator_biastype[index] == 0:
-            force = abs(model.actuator_ctrlrange[index]).max() * model.actuator_gainprm[index, 0]
-        torque = max(torque, float(force * abs(model.actuator_gear[index]).max()))
-    return torque
-
-
-def _torque_of_masses(model: mujoco.MjModel, body: int) -> float:
-    """Three times the torque that holds the lighter side of a joint level, in N m."""
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    mass, total = model.body_subtreemass[body], model.body_subtreemass[1]
-    beyond = data.subtree_com[body]
-    behind = (total * data.subtree_com[1] - mass * beyond) / max(total - mass, 1e-9)
-    lighter, weight = (beyond, mass) if mass < total - mass else (behind, total - mass)
-    lever = float(np.linalg.norm(lighter - data.xanchor[joints_of(model, body)[0]]))
-    return max(3 * 9.81 * float(weight) * lever, 1.0)

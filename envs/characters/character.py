@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 
 from torchrl_mcp.envs.characters.contract import Violation, violations
+from torchrl_mcp.envs.characters.sides import SIDES, Sides
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Character:
         key_bodies: Bodies whose positions best describe a pose: head, hands, feet.
         carrier: Body that picks up the box of the carry task, or None if there is none.
         file: MJCF file; None for the library's file of that name.
+        sides: Beginnings or ends of bodies' names on the right and on the left, such as ``(("FR_", "FL_"),)``.
     """
 
     name: str
@@ -33,6 +35,7 @@ class Character:
     key_bodies: tuple[str, ...]
     carrier: str | None
     file: Path | None = None
+    sides: Sides = SIDES
 
     def spec(self, *, self_collision: bool = False) -> mujoco.MjSpec:
         """Return the body, for a scene.
@@ -50,5 +53,6 @@ class Character:
 
     def check(self) -> list[Violation]:
         """Return the body's violations of the contract above, each with its remedy; empty if there are none."""
-        model = self.spec().compile()
-        return violations(model, feet=self.feet, key_bodies=self.key_bodies, carrier=self.carrier)
+        return violations(
+            self.spec(), feet=self.feet, key_bodies=self.key_bodies, carrier=self.carrier, sides=self.sides
+        )

@@ -7,6 +7,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from torchrl_mcp.envs.characters.sides import SIDES, Sides, twin
+from torchrl_mcp.envs.characters.stance import collapse
+
 SOLE = 0.005
 """Largest distance in metres of the lowest point from the ground."""
 
@@ -17,6 +20,9 @@ FREE, BALL, HINGE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE)
 )
 SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+
+
+NAME_SIDES = "say how names tell the sides apart, such as --sides FR_:FL_ RR_:RL_, or rename bodies"
 
 
 class Violation(NamedTuple):
@@ -36,27 +42,40 @@ class Violation(NamedTuple):
 
 
 def violations(
-    model: mujoco.MjModel, *, feet: Sequence[str], key_bodies: Sequence[str] = (), carrier: str | None = None
+    spec: mujoco.MjSpec,
+    *,
+    feet: Sequence[str],
+    key_bodies: Sequence[str] = (),
+    carrier: str | None = None,
+    sides: Sides = SIDES,
 ) -> list[Violation]:
-    """Return the violations of a compiled body; empty if it is a character.
+    """Return the violations of a body; empty if it is a character.
+
+    A body with no other violation has to hold its rest pose for two seconds.
 
     Args:
-        model: The body alone.
+        spec: The body alone.
         feet: Bodies that may touch the ground.
         key_bodies: Bodies whose positions best describe a pose.
         carrier: Body that can carry a box, or None.
+        sides: Beginnings or ends of bodies' names, right and left.
     """
+    model = spec.compile()
     named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
-    return [
+    found = [
         *_scenery(model),
         *_root(model),
         *_joints(model),
         *_actuators(model),
         *_shapes(model),
         *_rest(model),
-        *_names(model, named),
+        *_names(model, named, sides),
         *_timestep(model),
     ]
+    if not found and (failure := collapse(spec, tuple(feet))):
+        remedy = "give it larger torques and gains, another pose, or feet on which it can stand"
+        return [Violation(f"does not hold its rest pose: {failure}", remedy)]
+    return found
 
 
 def lowest_bodies(model: mujoco.MjModel, *, within: float = 0.03) -> tuple[float, list[str]]:
@@ -112,7 +131,9 @@ def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
         name, joints = model.body(body).name, joints_of(model, body)
         kinds = kinds_of(model, body)
         if not name:
-            yield Violation(f"body {body} has no name", "name it")
+            parent = model.body(model.body_parentid[body]).name
+            yield Violation(f"body {body}, on {parent or model.body_parentid[body]}, has no name", "name it")
+            continue
         if len(joints) > 1 and all(kind == HINGE for kind in kinds):
             names = ", ".join(model.joint(joint).name for joint in joints)
             yield Violation(f"{name} has several hinges ({names}) where a ball is expected", "make them a ball joint")
@@ -176,23 +197,24 @@ def _rest(model: mujoco.MjModel) -> Iterator[Violation]:
     lowest, _ = lowest_bodies(model)
     if abs(lowest) > SOLE:
         yield Violation(
-            f"rests {lowest:+.3f} m above the ground", f"lower the root by {lowest:.3f} m: soles are on z = 0"
+            f"rests {lowest:+.3f} m above the ground",
+            f"{'lower' if lowest > 0 else 'raise'} the root by {abs(lowest):.3f} m: soles are on z = 0",
         )
 
 
-def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]]) -> Iterator[Violation]:
+def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]], sides: Sides) -> Iterator[Violation]:
     bodies = [model.body(body).name for body in range(1, model.nbody)]
     if not named["feet"]:
         yield Violation("no feet are named", f"name the bodies that may touch the ground, of {', '.join(bodies)}")
     for kind, names in named.items():
         if unknown := [name for name in names if name not in bodies]:
             yield Violation(f"{kind} names {', '.join(unknown)}, which it lacks", f"name some of {', '.join(bodies)}")
-    sides = [name for name in bodies if name.startswith(("left_", "right_"))]
-    swapped = {name: {"left": "right", "right": "left"}[name.split("_")[0]] + name[name.index("_") :] for name in sides}
-    if alone := [name for name, twin in swapped.items() if twin not in bodies]:
-        yield Violation(f"{', '.join(alone)} has no twin on the other side", "call pairs left_NAME and right_NAME")
-    elif not sides:
-        yield Violation("there is no mirror map, for no body is called left_NAME or right_NAME", "call pairs so")
+    pairs = " ".join(f"{right}:{left}" for right, left in sides)
+    sided = [name for name in bodies if name and twin(name, sides) != name]
+    if alone := [name for name in sided if twin(name, sides) not in bodies]:
+        yield Violation(f"{', '.join(alone)} has no twin on the other side ({pairs})", NAME_SIDES)
+    elif not sided:
+        yield Violation(f"no body's name begins or ends with a side ({pairs or 'none is known'})", NAME_SIDES)
 
 
 def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.sides import Sides, twin
 
 
 @cache
@@ -65,7 +66,7 @@ def joint_layout(character: str) -> JointLayout:
     hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     offsets = torch.from_numpy((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) * 3)[~hinges]
     positions, velocities = torch.from_numpy(model.jnt_qposadr).long(), torch.from_numpy(model.jnt_dofadr).long()
-    mirror, mirror_sign = _mirror(model, names)
+    mirror, mirror_sign = _mirror(model, names, CHARACTERS[character].sides)
     return JointLayout(
         names=names,
         nq=model.nq,
@@ -79,26 +80,18 @@ def joint_layout(character: str) -> JointLayout:
     )
 
 
-def twin(name: str) -> str:
-    """Name of the same part on the other side of the body; a central part is its own twin."""
-    for side, other in (("left_", "right_"), ("right_", "left_")):
-        if name.startswith(side):
-            return other + name.removeprefix(side)
-    return name
-
-
-def _mirror(model: mujoco.MjModel, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
+def _mirror(model: mujoco.MjModel, names: tuple[str, ...], sides: Sides) -> tuple[Tensor, Tensor]:
     """Reflect y: a position changes y; a rotation, a pseudo-vector, changes x and z; left and right are exchanged."""
     source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
     for joint, name in enumerate(names):
-        here, there = model.jnt_qposadr[joint], model.joint(twin(name)).qposadr[0]
+        here, there = model.jnt_qposadr[joint], model.joint(twin(name, sides)).qposadr[0]
         match model.jnt_type[joint]:
             case mujoco.mjtJoint.mjJNT_FREE:
                 signs = [1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
             case mujoco.mjtJoint.mjJNT_BALL:
                 signs = [1.0, -1.0, 1.0, -1.0]
             case _:
-                axis, other = model.joint(name).axis, model.joint(twin(name)).axis
+                axis, other = model.joint(name).axis, model.joint(twin(name, sides)).axis
                 signs = [float(axis[1] * other[1] - axis[0] * other[0] - axis[2] * other[2])]
         source[here : here + len(signs)] = torch.arange(there, there + len(signs))
         sign[here : here + len(signs)] = torch.tensor(signs, dtype=torch.float64).round()

@@ -6,7 +6,7 @@ import mujoco
 import torch
 from torch import Tensor, nn
 
-from torchrl_mcp.envs.characters.joints import twin
+from torchrl_mcp.envs.characters.sides import SIDES, Sides, twin
 
 BODY_SIGNS = (1, -1, 1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
 """Signs of a body's observation: a vector changes y; a rotation or spin, a pseudo-vector, changes x and z."""
@@ -46,31 +46,35 @@ def mirror_signs(signs: Sequence[float]) -> Mirror:
     return Mirror(range(len(signs)), signs)
 
 
-def mirror_bodies(names: Sequence[str], *, repeats: int = 1) -> Mirror:
+def mirror_bodies(names: Sequence[str], *, repeats: int = 1, sides: Sides = SIDES) -> Mirror:
     """Return the reflection of :func:`~torchrl_mcp.envs.observations.bodies_in_heading_frame`.
 
     Args:
-        names: Names of the bodies, with ``left_`` and ``right_`` for the two sides.
+        names: Names of the bodies.
         repeats: Number of consecutive observations of all bodies.
+        sides: Beginnings or ends of names, right and left.
     """
     size = len(BODY_SIGNS)
-    twins = [names.index(twin(name)) for name in names]
+    twins = [names.index(twin(name, sides)) for name in names]
     once = [size * body + entry for body in twins for entry in range(size)]
     sources = [len(once) * time + source for time in range(repeats) for source in once]
     return Mirror(sources, list(BODY_SIGNS) * len(names) * repeats)
 
 
-def mirror_state(names: Sequence[str]) -> Mirror:
+def mirror_state(names: Sequence[str], *, sides: Sides = SIDES) -> Mirror:
     """Return the reflection of a :func:`~torchrl_mcp.envs.observations.character_state` of the bodies ``names``."""
-    bodies = mirror_bodies(names)
+    bodies = mirror_bodies(names, sides=sides)
     return Mirror([0, *(1 + bodies.sources).tolist()], [1.0, *bodies.signs.tolist()])
 
 
-def mirror_actions(model: mujoco.MjModel) -> Mirror:
+def mirror_actions(model: mujoco.MjModel, *, sides: Sides = SIDES) -> Mirror:
     """Return the reflection of a character's controls, which are rotation targets with the same scale on both sides."""
     names = [model.actuator(index).name for index in range(model.nu)]
     axes = torch.tensor([_axis(model, index) for index in range(model.nu)])
-    sources = torch.tensor([names.index(twin(name)) for name in names])
+    joints = [model.joint(index).name for index in model.actuator_trnid[:, 0]]
+    sources = torch.tensor(
+        [names.index(twin(joint, sides) + name.removeprefix(joint)) for joint, name in zip(joints, names, strict=True)]
+    )
     signs = (axes * axes[sources] * torch.tensor([-1.0, 1.0, -1.0])).sum(-1).round()
     return Mirror(sources.tolist(), signs.tolist())
 

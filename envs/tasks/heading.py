@@ -128,7 +128,7 @@ class Heading(PDCharacterEnv):
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction, of the speed's length in a second."""
-        tail = self.com[index].cpu() + torch.tensor([0.0, 0.0, 0.8])
+        tail = self.com[index].cpu() + torch.tensor([0.0, 0.0, 0.9]) * self._rest[2].cpu()  # above the head
         way = unit_vector(self.episode["direction"][index].cpu()) * self.episode["speed"][index].cpu()
         return [(tail.double().numpy(), (tail + torch.nn.functional.pad(way, (0, 1))).numpy())]
 

@@ -205,7 +205,7 @@ class Imitation(PDCharacterEnv):
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return mirror_bodies(self._bodies, repeats=NUM_TARGETS)
+        return mirror_bodies(self._bodies, repeats=NUM_TARGETS, sides=self.character.sides)
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and the next states of the reference as the character sees them."""

@@ -10,6 +10,7 @@ from PIL import Image
 
 from torchrl_mcp.cli import motions
 from torchrl_mcp.commands import motions as motion_files
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk
@@ -71,6 +72,26 @@ def test_clips_and_recordings_can_be_inspected(run, tmp_path):
     of_recording = run("inspect", "walk.txt", "--character", "biped")[1]
     assert of_recording.replace("0.0 deg, 0 %", "-").split() == output.split()  # a clip tells of no cut
     assert {path.name for path in tmp_path.iterdir()} == {"walk.txt", "walk.npz"}
+
+
+def test_a_clip_reaches_a_character_of_a_module_with_the_bodies_that_are_printed(run, tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, "lizard", raising=False)
+    monkeypatch.setitem(CHARACTERS, "lizard", None)  # is taken out again afterwards
+    (tmp_path / "lizard.py").write_text(
+        "from dataclasses import replace\n"
+        "from torchrl_mcp.envs.characters import CHARACTERS, TREX\n"
+        "CHARACTERS['lizard'] = replace(TREX, key_bodies=('head',))\n"
+    )
+    (tmp_path / "bodies.yaml").write_text("neck: upper_neck")
+    stride("humanoid", 1.0, 0.0, strides=1).save("walk.npz")
+    words = ("import", "walk.npz", "--character", "lizard", "--module", "lizard", "--output", "clips")
+    status, output, errors = run(*words, "--bodies", "bodies.yaml")
+    assert (status, errors) == (0, "")
+    assert "lizard follows with root: root, chest: chest, right_hip: right_hip" in output
+    assert "neck: upper_neck" in output
+    assert re.search(r"Bones miss their directions in walk by \d+\.\d deg in the median", output)
+    assert MotionClip.load(tmp_path / "clips" / "walk.npz").character == "lizard"
+    assert "follows" not in run("inspect", "clips/walk.npz", "--module", "lizard")[1]
 
 
 def test_inspect_shows_the_strides_of_people_if_asked_to(run):
@@ -206,9 +227,15 @@ WRONG = {
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
     "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
     "no BVH": (["import", "broken.bvh"], r"broken\.bvh:1: does not begin with HIERARCHY"),
-    "wrong character": (
-        ["import", "stand.txt", "--character", "trex"],
-        "character='trex' has not the joints of a human",
+    "needless bodies": (
+        ["import", "stand.txt", "--bodies", "bodies.yaml"],
+        "bodies do not apply to character=humanoid",
+    ),
+    "no bodies": (["import", "stand.txt", "--character", "trex", "--bodies", "notes.md"], "notes.md should have lines"),
+    "missing bodies": (["import", "stand.txt", "--bodies", "nowhere.yaml"], "nowhere.yaml"),
+    "no module": (
+        ["import", "stand.txt", "--module", "nowhere"],
+        "--module nowhere is not found: call from the folder",
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: give it \(--fps\)"),
@@ -225,6 +252,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     (tmp_path / "broken.bvh").write_text("nothing")
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
     (tmp_path / "notes.md").write_text("nothing")
+    (tmp_path / "bodies.yaml").write_text("chest: chest")
     (tmp_path / "stand.csv").write_text("0,0,1,1,0,0,0\n" * 2)
     (tmp_path / "more").mkdir()
     for path in (tmp_path / "stand.txt", tmp_path / "more" / "stand.txt"):

@@ -14,6 +14,9 @@ EXAMPLES = f"""\
 examples:
   {PROGRAM} check robot.xml                # every violation of the contract, with its remedy
   {PROGRAM} adapt robot.xml --name robot2  # writes robot2.xml, robot2.py and own/character/robot2.yaml
+  {PROGRAM} adapt robot.xml --name robot2 --pose home --sides FR_:FL_ RR_:RL_ --torque hip=24 calf=36 --gain .=50
+
+A PATTERN is a regular expression, which is searched for in the names of joints and bodies.
 """
 
 
@@ -42,6 +45,14 @@ def parser() -> argparse.ArgumentParser:
         "--feet", nargs="+", metavar="BODY", help="bodies that may touch the ground (default: the lowest)"
     )
 
+    shared.add_argument(
+        "--sides",
+        nargs="+",
+        type=_pair,
+        metavar="RIGHT:LEFT",
+        help="beginnings or ends of names on the right and on the left (default: usual ones that occur)",
+    )
+
     command = commands.add_parser(
         "check", parents=[shared], help="list violations; the exit status is 1 if there are any"
     )
@@ -49,8 +60,35 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("adapt", parents=[shared], help="remove and convert parts to make a character")
     command.add_argument("--name", type=_name, required=True, help="name of the character and of its files")
     command.add_argument("--output", type=Path, default=Path(), help="folder to write to (default here)")
+    command.add_argument("--root", metavar="BODY", help="body that carries the others (default: the most others)")
+    command.add_argument(
+        "--pose", nargs="+", default=[], metavar="POSE", help="rest pose: a keyframe, and PATTERN=RADIANS of hinges"
+    )
+    for option, unit, what in (("torque", "NM", "limits of torques in N m"), ("gain", "KP", "gains in N m/rad")):
+        command.add_argument(
+            f"--{option}", nargs="+", default=[], type=_value, metavar=f"PATTERN={unit}", help=f"{what}, by joint"
+        )
     command.set_defaults(run="adapt")
     return parser
+
+
+def _pair(text: str) -> tuple[str, str]:
+    right, _, left = text.partition(":")
+    if not right or not left or right == left:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form RIGHT:LEFT, such as FR_:FL_")
+    return right, left
+
+
+def _value(text: str) -> tuple[str, float]:
+    pattern, _, number = text.rpartition("=")
+    try:
+        re.compile(pattern)
+        value = float(number)
+    except (re.error, ValueError):
+        value = 0.0
+    if not (pattern and 0 < value < float("inf")):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form PATTERN=NUMBER, such as ankle=50")
+    return pattern, value
 
 
 def _name(text: str) -> str:

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torchrl_mcp.cli.parsing import interruptible, new_parser
+from torchrl_mcp.cli.parsing import interruptible, new_parser, own_module
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -18,6 +18,7 @@ examples:
   {PROGRAM} import CMU/01/01_01_poses.npz --output clips
   {PROGRAM} import walk.csv --character trex --fps 50 --quaternion xyzw
   {PROGRAM} import walk.bvh --scale 0.3048 --map left_knee=LKnee --map right_knee=RKnee
+  {PROGRAM} import walk.bvh clips/walk.npz --character g1 --module g1 --output g1_clips
   {PROGRAM} inspect clips/*.npz --strides
   {PROGRAM} render clips/walk.npz --output pictures
   {PROGRAM} build-paper-corpus downloads --output corpus
@@ -32,8 +33,10 @@ def main() -> None:
         require_files(arguments)
         from torchrl_mcp.commands import motions
 
+        if arguments.module:
+            motions.add_characters(arguments.module)
         getattr(motions, arguments.run)(arguments)
-    except (BadZipFile, OSError, RuntimeError, ValueError) as error:
+    except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -55,10 +58,10 @@ def parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="command")
     target, source = argparse.ArgumentParser(add_help=False), argparse.ArgumentParser(add_help=False)
     target.add_argument(
-        "--character",
-        default="humanoid",
-        metavar="NAME",
-        help="character of the clips: humanoid (default), biped, or any for states of its own",
+        "--character", metavar="NAME", help="character of the clips (default: the clip's own, or humanoid)"
+    )
+    target.add_argument(
+        "--module", type=own_module, metavar="MODULE", help="Python module that adds the character to the library's"
     )
     target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
@@ -74,6 +77,12 @@ def parser() -> argparse.ArgumentParser:
         "--rest-frame", type=int, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
     )
     source.add_argument("--up", metavar="AXIS", help="axis of the files that points up: x, y, z; --up=-y for downwards")
+    source.add_argument(
+        "--bodies",
+        type=Path,
+        metavar="FILE",
+        help="bodies of the character by part of a person, as 'PART: BODY' lines (default: guessed from names)",
+    )
     source.add_argument("--asf", type=Path, help="skeleton of .amc files, if not in their folder")
     source.add_argument("--body-model", type=Path, help="body model (.npz) of SMPL files (default: the mean body)")
     source.add_argument("--quaternion", choices=("wxyz", "xyzw"), help="order of the quaternions of files of joints")

@@ -1,7 +1,7 @@
 """Checking files of characters, and converting other bodies into characters."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
@@ -9,8 +9,11 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 # isort: split
 import mujoco
 
-from torchrl_mcp.envs.characters.adapt import adapted, key_bodies
+from torchrl_mcp.envs.characters.adapt import Adapted, adapted, key_bodies
 from torchrl_mcp.envs.characters.contract import Violation, lowest_bodies, violations
+from torchrl_mcp.envs.characters.drives import GUESSED, Drive
+from torchrl_mcp.envs.characters.sides import SIDES, Sides, guessed_sides
+from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import replacing
 
 MODULE = '''\
@@ -26,6 +29,7 @@ CHARACTERS["{name}"] = Character(
     key_bodies={key_bodies!r},
     carrier=None,
     file=Path(__file__).with_name("{name}.xml"),
+    sides={sides!r},
 )
 '''
 
@@ -36,13 +40,18 @@ module: {name} # is imported before the character is looked up
 action_std: 0.1 # of the action before training, where 1 is half the range of a joint's targets
 """
 
+GRAVITY = 9.81
+"""Acceleration of free fall in m/s^2, by which the unit of length of a file is recognised."""
+
 
 def check(arguments: argparse.Namespace) -> int:
     """Print each violation of the contract; return the exit status."""
-    model = _read(arguments.file)
-    found = violations(model, feet=_feet(model, arguments.feet))
-    print(*(f"- {violation}" for violation in found), sep="\n", end="\n" if found else "")
-    print(_verdict(arguments.file, found, _feet(model, arguments.feet)))
+    spec = _read(arguments.file)
+    model = spec.compile()
+    feet, sides = _feet(model, arguments.feet), _sides(model, arguments.sides)
+    found = violations(spec, feet=feet, sides=sides)
+    _print(found)
+    print(_verdict(arguments.file, found, feet))
     return bool(found)
 
 
@@ -50,30 +59,37 @@ def adapt(arguments: argparse.Namespace) -> int:
     """Convert a file into a character, and write it with its module and its configuration.
 
     Raises:
-        ValueError: If MuJoCo cannot read the file, or one to write is there already.
+        ValueError: If MuJoCo cannot read the file or what was made of it, or a file to write is there already.
     """
-    name, folder = arguments.name, arguments.output
-    spec = adapted(_read(arguments.file))
-    spec.modelname = name
-    model = spec.compile()
-    feet = _feet(model, arguments.feet)
-    written = {
-        folder / f"{name}.xml": spec.to_xml(),
-        folder / f"{name}.py": MODULE.format(
-            name=name, source=arguments.file.name, feet=tuple(feet), key_bodies=tuple(key_bodies(model))
-        ),
-        folder / "own" / "character" / f"{name}.yaml": CONFIG.format(name=name),
-    }
-    for path in written:
-        if path.exists():
-            raise ValueError(f"{path} is there already: pass another --name or --output, or remove it")
-    for path, text in written.items():
-        with replacing(path) as partial:
-            partial.write_text(text)
-        print(path)
-    found = violations(model, feet=feet, key_bodies=key_bodies(model))
-    print(*(f"- {violation}" for violation in found), sep="\n", end="\n" if found else "")
-    print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.1f} kg. Next:")
+    name, folder, source = arguments.name, arguments.output, _read(arguments.file).compile()
+    body = adapted(
+        source,
+        root=arguments.root,
+        pose=arguments.pose,
+        feet=arguments.feet,
+        sides=arguments.sides and tuple(arguments.sides),
+        torques=dict(arguments.torque),
+        gains=dict(arguments.gain),
+    )
+    body.spec.modelname = name
+    body.spec.compile()
+    text = body.spec.to_xml()
+    written = _parsed(text, f"what was made of {arguments.file}")
+    model = written.compile()
+    ends = tuple(key_bodies(model))
+    _write(
+        {
+            folder / f"{name}.xml": text,
+            folder / f"{name}.py": MODULE.format(
+                name=name, source=arguments.file.name, feet=body.feet, key_bodies=ends, sides=body.sides
+            ),
+            folder / "own" / "character" / f"{name}.yaml": CONFIG.format(name=name),
+        }
+    )
+    print(*_description(body, source, arguments.pose), sep="\n")
+    found = violations(written, feet=body.feet, key_bodies=ends, sides=body.sides)
+    _print(found)
+    print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.3g} kg. Next:")
     if folder != Path():
         print(f"  cd {folder}")
     print(f"  torchrl-mcp-play --agent zero --config-dir own task=heading character={name}")
@@ -81,20 +97,82 @@ def adapt(arguments: argparse.Namespace) -> int:
     return bool(found)
 
 
-def _read(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF file.
+def _description(body: Adapted, source: mujoco.MjModel, pose: Sequence[str]) -> Iterator[str]:
+    """Yield what was found and chosen, and a table of the joints."""
+    yield f"root: {body.root}" + (f" (left out: {', '.join(body.left_out)})" if body.left_out else "")
+    yield f"pose: {' '.join(pose) or 'as in the file'}"
+    yield f"feet: {', '.join(body.feet)}"
+    yield f"sides: {' '.join(f'{right}:{left}' for right, left in body.sides) or 'none found'}"
+    gravity = float(abs(source.opt.gravity).max())
+    if gravity and abs(gravity / GRAVITY - 1) > 0.1:
+        yield f"units: gravity is {gravity:.4g} in the file, so its lengths are not in metres; they are taken as metres"
+    yield ""
+    yield text_table([_row(name, drive, body.ranges[name]) for name, drive in body.drives.items()])
+    guesses = sum([drive.torque_from, drive.gain_from].count(GUESSED) for drive in body.drives.values())
+    if guesses:
+        yield f"{guesses} values are guessed from the weights: give those of the maker with --torque and --gain"
+
+
+def _row(name: str, drive: Drive, limits: tuple[float, float]) -> dict[str, str]:
+    low, high = limits
+    kept = {"spring": drive.spring, "friction": drive.friction}
+    return {
+        "joint": name,
+        "range rad": f"{low:.3g} to {high:.3g}",
+        "torque N m": f"{drive.torque:.3g} {drive.torque_from}",
+        "gain N m/rad": f"{drive.gain:.3g} {drive.gain_from}",
+        "damping N m s/rad": f"{drive.damping:.3g} + {drive.passive:.3g}",
+        "armature kg m2": f"{drive.armature:.3g}",
+        "": ", ".join([*(f"{key} {value:.3g}" for key, value in kept.items() if value), *filter(None, [drive.remark])]),
+    }
+
+
+def _read(path: Path) -> mujoco.MjSpec:
+    """Read and compile an MJCF file.
 
     Raises:
-        ValueError: If MuJoCo cannot read it.
+        ValueError: If MuJoCo cannot.
     """
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {path}: {error}") from error
+    return spec
+
+
+def _parsed(text: str, what: str) -> mujoco.MjSpec:
+    """Read and compile MJCF."""
+    try:
+        spec = mujoco.MjSpec.from_string(text)
+        spec.compile()
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {what}: {error}") from error
+    return spec
+
+
+def _write(written: dict[Path, str]) -> None:
+    """Write files, none of which may be there."""
+    for path in written:
+        if path.exists():
+            raise ValueError(f"{path} is there already: pass another --name or --output, or remove it")
+    for path, text in written.items():
+        with replacing(path) as partial:
+            partial.write_text(text)
+        print(path)
+
+
+def _print(found: Sequence[Violation]) -> None:
+    for violation in found:
+        print(f"- {violation}")
 
 
 def _feet(model: mujoco.MjModel, named: Sequence[str] | None) -> list[str]:
     return list(named) if named else lowest_bodies(model)[1]
+
+
+def _sides(model: mujoco.MjModel, given: Sequence[tuple[str, str]] | None) -> Sides:
+    return tuple(given or guessed_sides(model.body(body).name for body in range(1, model.nbody))) or SIDES
 
 
 def _verdict(path: Path, found: Sequence[Violation], feet: Sequence[str]) -> str:

@@ -3,14 +3,15 @@
 import argparse
 import math
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 
 from torch import Tensor
 
-from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.importer import Import, imported
 from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
+from torchrl_mcp.envs.motions.capture.key_bodies import read_key_map
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
@@ -66,6 +67,22 @@ SLIDING = 0.2
 """Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
 
 
+def add_characters(module: str) -> None:
+    """Import a module that adds characters to the library's.
+
+    Raises:
+        ValueError: If there is no such module.
+    """
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        raise ValueError(
+            f"--module {module} is not found: call from the folder of {module}.py, or add that to PYTHONPATH"
+        ) from error
+
+
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file, and its mirror image if requested."""
     motions = _load(arguments)
@@ -102,7 +119,7 @@ def build_paper_corpus(arguments: argparse.Namespace) -> None:
         raise ValueError(f"{arguments.folder} lacks{lines}\nDownload them into it, and mind their terms of use.")
     motions = {}
     for name, [path] in paths.items():
-        motion = imported(path, arguments.character, rate=arguments.rate)
+        motion = imported(path, arguments.character or HUMANS[0], rate=arguments.rate)
         clip = motion.clip
         if abs(clip.duration - PAPER_CORPUS[name]) > 0.1:
             expected = f"{path} lasts {clip.duration:.2f} s, and the paper's corpus needs {PAPER_CORPUS[name]:.2f} s"
@@ -119,12 +136,11 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
     for path in arguments.files:
         if path.stem in motions:
             raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
-        if path.suffix == ".npz" and "character" in Archive(path).names:
-            motions[path.stem] = Import(MotionClip.load(path))
-            continue
+        saved = path.suffix == ".npz" and "character" in Archive(path).names
+        own = str(Archive(path).array("character")) if saved else HUMANS[0]
         motions[path.stem] = imported(
             path,
-            arguments.character,
+            arguments.character or own,
             rate=arguments.rate,
             fps=arguments.fps,
             scale=arguments.scale,
@@ -136,6 +152,7 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
             body_model=arguments.body_model,
             quaternion=arguments.quaternion,
             joints=arguments.joints.split(",") if arguments.joints else None,
+            bodies=read_key_map(arguments.bodies) if arguments.bodies else None,
         )
     return motions
 
@@ -156,6 +173,16 @@ def _table(motions: Mapping[str, Import]) -> str:
     rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
     lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
     for name, motion in motions.items():
+        if motion.bodies:
+            often, most = (float(motion.missed.quantile(share)) for share in (0.5, 1.0))
+            lines += (
+                f"\nBones miss their directions in {name} by {often:.1f} deg in the median, {most:.1f} deg at most."
+            )
+    for character, bodies in {motion.clip.character: motion.bodies for motion in motions.values()}.items():
+        if bodies:
+            pairs = ", ".join(f"{part}: {body}" for part, body in bodies.items())
+            lines += f"\n{character} follows with {pairs}. If this is wrong, give a file of such lines (--bodies)."
+    for name, motion in motions.items():
         if motion.assumed:
             lines += f"\nAssumed for {name}: {motion.assumed}. If this is wrong, say which axis points up (--up)."
     if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
@@ -164,7 +191,7 @@ def _table(motions: Mapping[str, Import]) -> str:
 
 
 def _row(name: str, motion: Import, numbers: Summary) -> tuple[str, ...]:
-    clip, rest_lean, cut, _ = motion
+    clip, rest_lean, cut, *_ = motion
     demand = feasibility(clip)
     return (
         name,

@@ -55,13 +55,14 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
     camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
     camera.view.lookat = player.data.subtree_com[1]
+    lag = min(1.0, player.extent)  # small characters leave the picture sooner
     fixed = model.light_bodyid == 0  # fixed lights move with the character, because shadows are drawn only near them
     try:
         for step in range(round(seconds / timestep)):
             player.step()
             data = player.data
             centre = data.subtree_com[1]
-            camera.view.lookat = centre if player.began else followed(camera.view.lookat, centre, timestep)
+            camera.view.lookat = centre if player.began else followed(camera.view.lookat, centre, timestep / lag)
             data.light_xpos[fixed, :2] += centre[:2]
             if step % every == every - 1:
                 picture = Image.fromarray(camera.picture(data, distance=distance, shapes=player.shapes).numpy())

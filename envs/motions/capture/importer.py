@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -10,10 +11,15 @@ from torch import Tensor
 
 from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
+from torchrl_mcp.envs.motions.capture.anatomy import ARM, LEGS, SIDES, TRUNK, limb
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
+from torchrl_mcp.envs.motions.capture.clips import as_source
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
-from torchrl_mcp.envs.motions.capture.joint_motion import QUATERNIONS, assembled, require_human
+from torchrl_mcp.envs.motions.capture.inverse_kinematics import solved
+from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS, QUATERNIONS, JointMotion, assembled
+from torchrl_mcp.envs.motions.capture.key_bodies import key_map
 from torchrl_mcp.envs.motions.capture.qpos import read_qpos
+from torchrl_mcp.envs.motions.capture.recording import record
 from torchrl_mcp.envs.motions.capture.retarget import retarget
 from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
 from torchrl_mcp.envs.motions.capture.smpl import is_smpl, read_smpl
@@ -23,18 +29,25 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
 MISREAD = 30.0
 """Degrees beyond its limit that a joint reaches in most frames only if a recording is read wrongly."""
 
-KINDS = {"skeleton": "a skeleton's motion", "deepmimic": "a file of DeepMimic's", "qpos": "states of a character"}
+KINDS = {
+    "skeleton": "a skeleton's motion",
+    "deepmimic": "a file of DeepMimic's",
+    "clip": "a clip",
+    "qpos": "states of a character",
+}
 """Kinds of files, as errors call them."""
 
 OPTIONS = {
-    "skeleton": ("scale", "up", "joint_map", "skip", "rest_frame", "asf", "body_model"),
-    "deepmimic": ("quaternion",),
+    "skeleton": ("scale", "up", "joint_map", "skip", "rest_frame", "asf", "body_model", "bodies"),
+    "deepmimic": ("quaternion", "bodies"),
+    "clip": ("joint_map", "skip", "bodies"),
     "qpos": ("quaternion", "joints"),
 }
 """Options that apply to a kind, beside the frame rates."""
 
 REMEDIES = {
-    "skeleton": "correct the order of its rotations or the map, or give another rest frame",
+    "skeleton": "correct the order of its rotations or the maps, or give another rest frame",
+    "clip": "correct the map of bodies (--bodies), or take another motion",
     "deepmimic": "reorder its quaternions, or say that they are x, y, z, w (--quaternion xyzw); angles are in radians",
     "qpos": "correct the order of its joints (--joints) or of its quaternions (--quaternion); angles are in radians",
 }
@@ -50,12 +63,16 @@ class Import(NamedTuple):
         cut: Greatest angle in degrees by which a joint of each frame of the file was cut to the character's limits,
             shape ``(T,)``; empty for clips.
         assumed: What was assumed about the standing pose against that of the file; or nothing.
+        bodies: Bodies of the character by part of the recorded person, if inverse kinematics fitted them.
+        missed: Greatest angle in degrees by which a bone of them misses its direction in each frame, shape ``(T,)``.
     """
 
     clip: MotionClip
     rest_lean: float = math.nan
     cut: Tensor = torch.empty(0)
     assumed: str = ""
+    bodies: Mapping[str, str] = MappingProxyType({})
+    missed: Tensor = torch.empty(0)
 
 
 def import_motion(path: str | Path, character: str, **options: Any) -> MotionClip:
@@ -84,13 +101,16 @@ def imported(
     body_model: str | Path | None = None,
     quaternion: str | None = None,
     joints: Sequence[str] | None = None,
+    bodies: Mapping[str, str] | None = None,
 ) -> Import:
     """Read a motion file and fit it to a character.
 
     The suffix determines the format. ``.bvh``, ``.amc`` (with its ``.asf``) and ``.npz`` of SMPL's bodies hold a
-    person's skeleton, which is retargeted to the humanoid or the biped. ``.json`` and ``.txt`` hold the joints of
-    DeepMimic's characters, in metres, for the humanoid or the biped. ``.csv`` and other ``.npz`` hold ``qpos`` of any
-    character, see :func:`~torchrl_mcp.envs.motions.capture.qpos.read_qpos`.
+    person's skeleton. ``.json`` and ``.txt`` hold the joints of DeepMimic's characters, in metres. A clip in ``.npz``
+    holds another character's motion. Humanoid and biped take over the turns of a person's joints, see
+    :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`; any other character follows by inverse kinematics, see
+    :func:`~torchrl_mcp.envs.motions.capture.inverse_kinematics.solved`. ``.csv`` and other ``.npz`` hold ``qpos`` of
+    the character, see :func:`~torchrl_mcp.envs.motions.capture.qpos.read_qpos`.
 
     Args:
         path: The file.
@@ -110,12 +130,15 @@ def imported(
             files, and in ``qpos`` for the order in which the root is upright.
         joints: Joints in the order of the columns of ``qpos``; None for the names in the file, or else the order of the
             character's model.
+        bodies: Bodies of the character by part of a person, for inverse kinematics, see
+            :func:`~torchrl_mcp.envs.motions.capture.key_bodies.key_map`.
 
     Raises:
         MotionFormatError: If the file cannot be used.
         ValueError: If an argument is out of range, or does not apply to the file.
+        ImportError: If inverse kinematics needs a package that is not installed.
     """
-    kind, rest_lean, assumed = _kind(path), math.nan, ""
+    kind = _kind(path)
     skeletal: dict[str, Any] = {
         "scale": scale,
         "up": up,
@@ -123,22 +146,70 @@ def imported(
         "skip": skip,
         "rest_frame": rest_frame,
     }
-    others = {"asf": asf, "body_model": body_model, "quaternion": quaternion, "joints": joints}
+    others = {"asf": asf, "body_model": body_model, "quaternion": quaternion, "joints": joints, "bodies": bodies}
     _require_applicable(path, kind, skeletal | others | {"skip": skip or None})
+    if bodies and character in HUMANS:
+        raise ValueError(f"bodies do not apply to character={character}, whose parts are known: leave them out")
     match kind:
         case "skeleton":
             source = _skeleton(path, fps=fps, asf=asf, body_model=body_model)
-            motion, body = retarget(source, character, **skeletal)
-            rest_lean, assumed = body.lean(), body.assumed
+            followers = {} if character in HUMANS else key_map(character, bodies)
+            return _retargeted(source, character, rate, kind, followers, **skeletal)
+        case "clip":
+            return _of_clip(path, MotionClip.load(path), character, rate, kind, bodies, joint_map=joint_map, skip=skip)
         case "deepmimic":
-            require_human(character)
+            human = character if character in HUMANS else "humanoid"
             motion = read_deepmimic(path, fps=fps, quaternion=quaternion or "wxyz")
-        case _:
-            motion = read_qpos(path, character, fps=fps, quaternion=quaternion, joints=joints)
+            found = _assembled(path, human, motion, rate, kind)
+            return found if character == human else _of_clip(path, found.clip, character, rate, kind, bodies)
+    motion = read_qpos(path, character, fps=fps, quaternion=quaternion, joints=joints)
+    return _assembled(path, character, motion, rate, kind)
+
+
+def _retargeted(
+    source: SourceMotion, character: str, rate: float, kind: str, bodies: Mapping[str, str], **skeletal: Any
+) -> Import:
+    """Retarget the motion of a skeleton, with a map of bodies for inverse kinematics."""
+    if character in HUMANS:
+        motion, body = retarget(source, character, **skeletal)
+        return _assembled(source.path, character, motion, rate, kind)._replace(
+            rest_lean=body.lean(), assumed=body.assumed
+        )
+    arms = [part for side in SIDES for part in limb(side, ARM) if limb(side, ARM)[0] in bodies]
+    body = record(source, tuple(dict.fromkeys((*TRUNK, *LEGS, *arms, *bodies))), **skeletal)
+    motion, missed = solved(body, character, bodies)
+    missed = torch.rad2deg(missed)
+    _require_within(source.path, missed, kind)
+    found = _assembled(source.path, character, motion, rate, kind)
+    return found._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies, missed=missed)
+
+
+def _of_clip(
+    path: str | Path,
+    clip: MotionClip,
+    character: str,
+    rate: float,
+    kind: str,
+    bodies: Mapping[str, str] | None,
+    *,
+    joint_map: Mapping[str, str] | None = None,
+    skip: int = 0,
+) -> Import:
+    """Retarget a clip of another character."""
+    if clip.character == character:
+        return Import(clip)
+    parts = key_map(clip.character, joint_map)
+    followers = {} if character in HUMANS else key_map(character, bodies)
+    followers = {part: body for part, body in followers.items() if part in parts}
+    return _retargeted(as_source(clip, path), character, rate, kind, followers, joint_map=parts, skip=skip, scale=1.0)
+
+
+def _assembled(path: str | Path, character: str, motion: JointMotion, rate: float, kind: str) -> Import:
+    """Make a clip of a motion, if limits leave most of it as it is."""
     clip, cut = assembled(character, motion, rate=rate)
     degrees = torch.rad2deg(cut)
     _require_within(path, degrees, kind)
-    return Import(clip, rest_lean, degrees, assumed)
+    return Import(clip, cut=degrees)
 
 
 def _kind(path: str | Path) -> str:
@@ -151,7 +222,8 @@ def _kind(path: str | Path) -> str:
         case ".csv":
             return "qpos"
         case ".npz":
-            return "skeleton" if is_smpl(Archive(path)) else "qpos"
+            archive = Archive(path)
+            return "clip" if "character" in archive.names else "skeleton" if is_smpl(archive) else "qpos"
     raise MotionFormatError(path, "ends in none of .bvh, .amc, .npz, .csv, .json and .txt: pass a motion, or rename it")
 
 

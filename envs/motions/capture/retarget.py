@@ -6,23 +6,17 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, SIDES, TRUNK, limb
-from torchrl_mcp.envs.motions.capture.joint_motion import JointMotion, require_human, speeds
+from torchrl_mcp.envs.motions.capture.feet import flat, from_straight, slope
+from torchrl_mcp.envs.motions.capture.joint_motion import JointMotion, require_human
 from torchrl_mcp.envs.motions.capture.recording import Recording, record
 from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion
 from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, inverse, multiply, rotate, shortest
 
 BENT = math.radians(15)
 """Least flexion in radians at which a knee or an elbow determines its plane."""
-
-STILL = 0.15
-"""Speed in m/s below which an ankle's foot is flat on the ground."""
-
-STEEPEST = 0.05
-"""Largest slope of a laboratory in metres per metre, three degrees."""
 
 UP = AXES[2]
 
@@ -72,7 +66,7 @@ def retarget(
     for side in SIDES:
         hip, knee, ankle = limb(side, LEG)
         thigh, motion[knee] = _hinged(body, limb(side, LEG), forward=-1.0)
-        shank, foot = multiply(thigh, _flexed(motion[knee])), _flat(body, ankle)
+        shank, foot = multiply(thigh, _flexed(motion[knee])), flat(body, ankle)
         motion[hip], motion[ankle] = _relative(root, thigh), _relative(shank, foot)
         if has_arms:
             shoulder, elbow, _ = limb(side, ARM)
@@ -81,7 +75,7 @@ def retarget(
     if has_arms:
         motion["neck"] = _relative(chest, body.turns["neck"])
     hips = (body.positions["right_hip"] + body.positions["left_hip"]) / 2
-    hips[:, 2] -= hips[:, :2] @ _slope(body)
+    hips[:, 2] -= hips[:, :2] @ slope(body)
     path = hips * (leg_length(character) / body.leg_length())
     return JointMotion(path, motion, body.times), body
 
@@ -121,8 +115,7 @@ def _hinged(body: Recording, joints: tuple[str, str, str], *, forward: float) ->
         Rotation of the upper bone, shape ``(T, 4)``, and angle of the hinge, shape ``(T,)``.
     """
     start, middle, end = joints
-    standing = normalize(body.standing[middle] - body.standing[start], dim=-1)
-    upper = multiply(body.turns[start], shortest(-UP, standing).expand_as(body.turns[start]))
+    upper = from_straight(body, start, middle)
     bone = body.direction(start, middle)
     upper = multiply(shortest(rotate(upper, -UP.expand_as(bone)), bone), upper)  # for bones that position channels move
     x, y, z = rotate(inverse(upper), body.direction(middle, end)).unbind(-1)
@@ -136,36 +129,3 @@ def _interpolated(angles: Tensor, known: Tensor) -> Tensor:
         return torch.zeros_like(angles)
     frames = known.nonzero().squeeze(-1).numpy()
     return torch.from_numpy(np.interp(np.arange(len(angles)), frames, np.unwrap(angles[known].numpy())))
-
-
-def _flat(body: Recording, ankle: str) -> Tensor:
-    """Rotation of a foot, ``(T, 4)``, with a constant turn that levels its sole in the median while it stands still."""
-    foot = body.turns[ankle]
-    still = foot[_still(body, ankle)]
-    if not len(still):
-        return foot
-    normal = rotate(inverse(still), UP.expand(len(still), 3)).median(dim=0).values
-    return multiply(foot, shortest(UP, normalize(normal, dim=-1)).expand_as(foot))
-
-
-def _slope(body: Recording) -> Tensor:
-    r"""Slope of the laboratory's ground along x and y, shape ``(2,)``, in metres per metre.
-
-    It is the slope of the plane through standing ankles at :math:`(p, z)`, relative to their mean, regularised towards
-    flat ground:
-
-    .. math:: s = (\langle p p^T \rangle + r^2 I)^{-1} \langle p z \rangle, \quad r = 0.3 \text{ m}
-    """
-    standing = torch.cat([body.positions[ankle][_still(body, ankle)] for ankle in ("right_ankle", "left_ankle")])
-    if not len(standing):
-        return torch.zeros(2, dtype=torch.float64)
-    place, height = (standing - standing.mean(0)).split([2, 1], dim=-1)
-    spread = place.mT @ place / len(place) + 0.3**2 * torch.eye(2, dtype=torch.float64)
-    slope = torch.linalg.solve(spread, place.mT @ height / len(place)).squeeze(-1)
-    return slope if slope.norm() < STEEPEST else torch.zeros_like(slope)  # steeper ground is stairs or a pit
-
-
-def _still(body: Recording, ankle: str) -> Tensor:
-    """Frames in which an ankle does not move, shape ``(T,)``, bool."""
-    slow = speeds(body.positions[ankle], body.times) < STILL
-    return torch.cat([slow[:1], slow])

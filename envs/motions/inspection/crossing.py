@@ -1,10 +1,13 @@
 """Distance between the legs: without self-collision, nothing else shows that they pass through each other."""
 
+from itertools import combinations, product
+
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
 
 FURTHEST = 1.0
@@ -12,10 +15,10 @@ FURTHEST = 1.0
 
 
 def legs_apart(character: str, qpos: Tensor) -> Tensor:
-    """Distance between the right and the left leg, feet included, between MuJoCo's collision shapes.
+    """Distance between any two legs, feet included, between MuJoCo's collision shapes.
 
     Args:
-        character: Name of a character whose legs begin at ``right_hip`` and ``left_hip``.
+        character: Name of a character with two feet or more.
         qpos: States, shape ``(T, nq)``.
 
     Returns:
@@ -23,22 +26,36 @@ def legs_apart(character: str, qpos: Tensor) -> Tensor:
     """
     model = character_model(character)
     data = mujoco.MjData(model)
-    right, left = (_leg_shapes(model, side) for side in ("right", "left"))
+    feet = [model.body(foot).id for foot in CHARACTERS[character].feet]
+    pairs = [
+        pair
+        for one, other in combinations(feet, 2)
+        for pair in product(_leg_shapes(model, one, other), _leg_shapes(model, other, one))
+    ]
     distances = np.empty(len(qpos))
     for frame, data.qpos in enumerate(qpos.double().numpy()):
         mujoco.mj_kinematics(model, data)
         distances[frame] = min(
-            mujoco.mj_geomDistance(model, data, one, other, FURTHEST, None) for one in right for other in left
+            (mujoco.mj_geomDistance(model, data, one, other, FURTHEST, None) for one, other in pairs), default=FURTHEST
         )
     return torch.from_numpy(distances)
 
 
-def _leg_shapes(model: mujoco.MjModel, side: str) -> list[int]:
-    """Colliding shapes of the hip's body and its descendants."""
-    bodies = {model.body(f"{side}_hip").id}
+def _leg_shapes(model: mujoco.MjModel, foot: int, other: int) -> list[int]:
+    """Colliding shapes of the leg of a foot: all that hangs on the first body that does not carry another foot."""
+    trunk = _line(model, other)
+    bodies = {next(body for body in reversed(_line(model, foot)) if body not in trunk)} if foot not in trunk else set()
     for body in range(model.nbody):
         if model.body_parentid[body] in bodies:
             bodies.add(body)
     return [
         shape for shape in range(model.ngeom) if model.geom_bodyid[shape] in bodies and model.geom_conaffinity[shape]
     ]
+
+
+def _line(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those on which it hangs."""
+    line = [body]
+    while line[-1]:
+        line.append(int(model.body_parentid[line[-1]]))
+    return line

@@ -141,7 +141,7 @@ def _inverse_dynamics(clip: MotionClip) -> tuple[np.ndarray, np.ndarray]:
 def _motor_torques(
     clip: MotionClip, inverse: np.ndarray, wrench: np.ndarray, centres: list[Tensor], shares: Tensor
 ) -> np.ndarray:
-    """Torques of the motors, ``(T, nu)``, with the load split between the feet by ``shares``, ``(T, 2)``."""
+    """Torques of the motors, ``(T, nu)``, with the load split between F feet by ``shares``, ``(T, F)``."""
     model = character_model(clip.character)
     data = mujoco.MjData(model)
     feet = [model.body(name).id for name in CHARACTERS[clip.character].feet]
@@ -166,7 +166,13 @@ def _centre(positions: Tensor, grounded: Tensor) -> Tensor:
 
 
 def _shares(pressure: Tensor, centres: list[Tensor], down: list[Tensor]) -> Tensor:
-    """Shares of the load on two feet, ``(T, 2)``: in double support by the position of the pressure between them."""
+    """Shares of the load on F feet, ``(T, F)``.
+
+    Two feet on the ground share it by the position of the pressure between them, and more of them equally.
+    """
+    if len(centres) != 2:
+        on = torch.stack(down, dim=-1).double()
+        return on / on.sum(-1, keepdim=True).clamp_min(1)
     first, second = centres[0][:, :2], centres[1][:, :2]
     between = second - first
     part = ((pressure - first) * between).sum(-1) / between.square().sum(-1)

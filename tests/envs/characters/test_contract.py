@@ -1,15 +1,13 @@
-"""What keeps a body from being a character is listed with remedies, and what can be converted is."""
+"""What keeps a body from being a character is listed with remedies."""
 
 from pathlib import Path
 
 import gymnasium
 import mujoco
-import numpy as np
 import pytest
 
 from torchrl_mcp.envs.characters import CHARACTERS, Character
-from torchrl_mcp.envs.characters.adapt import LIMIT_ANGLE, adapted, key_bodies
-from torchrl_mcp.envs.characters.contract import lowest_bodies, violations
+from torchrl_mcp.envs.characters.contract import violations
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 GAINS = 'kp="80" kv="7" ctrlrange="-1 1"'
@@ -45,6 +43,11 @@ WRONG = {
     "light": ({"scenery": "<light/>"}, "1 light(s) of its own"),
     "no free root": ({"root": ""}, "the root root has no free joint"),
     "two roots": ({"scenery": "<body><geom size='0.1' pos='0 0 1'/></body>"}, "2 bodies that hang on the world"),
+    "low": ({"height": 0.45}, "rests -0.100 m above the ground: raise the root by 0.100 m"),
+    "no name": (
+        {"scenery": "", "joint": "<joint name='left_leg'/><body><joint name='x'/><geom size='.1' contype='0'/></body>"},
+        "body 3, on left_leg, has no name",
+    ),
     "high": ({"height": 0.75}, "rests +0.200 m above the ground: lower the root by 0.200 m"),
     "collisions": ({"contype": 1}, "its shapes collide with one another"),
     "shape": ({"shape": "cylinder"}, "shapes of kind mjGEOM_CYLINDER: use spheres, capsules and boxes"),
@@ -68,13 +71,9 @@ WRONG = {
 }
 
 
-def found(file=None, feet=("left_leg",), **changes):
-    model = (
-        mujoco.MjModel.from_xml_path(str(file))
-        if file
-        else mujoco.MjModel.from_xml_string(BODY.format(**GOOD | changes))
-    )
-    return [str(violation) for violation in violations(model, feet=feet)]
+def found(file=None, feet=("left_leg", "right_leg"), sides=(("right_", "left_"),), **changes):
+    spec = mujoco.MjSpec.from_file(str(file)) if file else mujoco.MjSpec.from_string(BODY.format(**GOOD | changes))
+    return [str(violation) for violation in violations(spec, feet=feet, sides=sides)]
 
 
 @pytest.mark.parametrize("name", CHARACTERS)
@@ -98,8 +97,8 @@ def test_feet_must_be_bodies(feet, said):
 
 
 def test_a_timestep_must_divide_the_control_step():
-    model = mujoco.MjModel.from_xml_string(BODY.format(**GOOD).replace("0.008333333333", "0.003"))
-    (violation,) = violations(model, feet=["left_leg"])
+    spec = mujoco.MjSpec.from_string(BODY.format(**GOOD).replace("0.008333333333", "0.003"))
+    (violation,) = violations(spec, feet=["left_leg"])
     assert "does not divide 1/30 s" in str(violation)
 
 
@@ -109,64 +108,45 @@ def test_gymnasiums_humanoid_fails_for_its_motors_hinges_floor_and_height():
         assert part in said
 
 
-@pytest.fixture(scope="module")
-def gymnast():
-    before = mujoco.MjModel.from_xml_path(str(ASSETS / "humanoid.xml"))
-    return before, adapted(before).compile()
-
-
-def test_adapted_gymnasiums_humanoid_keeps_the_contract(gymnast):
-    _, after = gymnast
-    lowest, feet = lowest_bodies(after)
-    assert feet == ["right_foot", "left_foot"]
-    assert lowest == pytest.approx(0, abs=1e-9)
-    assert violations(after, feet=feet, key_bodies=key_bodies(after)) == []
-
-
-def test_adapting_keeps_masses_inertias_and_shapes(gymnast):
-    before, after = gymnast
-    for name in ("body_mass", "body_inertia", "body_ipos"):
-        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-12)
-    np.testing.assert_allclose(after.geom_size, before.geom_size[1:])  # the first is the floor
-
-
-def test_servos_hold_the_torques_of_the_motors_and_reach_them_at_the_angle_stated(gymnast):
-    before, after = gymnast
-    motor, servo = before.actuator("right_knee"), after.actuator("right_shin")
-    assert servo.forcerange[1] == pytest.approx(motor.gear[0] * motor.ctrlrange[1])
-    assert servo.gainprm[0] * LIMIT_ANGLE == pytest.approx(servo.forcerange[1])
-
-
-def test_the_ranges_of_a_balls_targets_hold_those_of_its_hinges(gymnast):
-    before, after = gymnast
-    for axis in "xyz":
-        low, high = before.joint(f"right_hip_{axis}").range
-        ends = after.actuator(f"right_thigh_{axis}").ctrlrange
-        assert ends[0] <= low
-        assert ends[1] >= high
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"joint": '<joint name="left_leg" type="slide"/>'}, "left_leg has a joint that is neither hinge nor ball"),
-        ({"root": ""}, "give the root a freejoint"),
-    ],
-)
-def test_what_cannot_be_converted_is_refused(changes, said):
-    with pytest.raises(ValueError, match=said):
-        adapted(mujoco.MjModel.from_xml_string(BODY.format(**GOOD | changes)))
-
-
-def test_a_joint_without_a_motor_can_hold_what_hangs_on_it():
-    body = BODY.format(**GOOD | {"actuator": ""})
-    model = adapted(mujoco.MjModel.from_xml_string(body)).compile()
-    mass, lever = model.body("left_leg").mass[0], 0.25
-    assert model.actuator("left_leg").forcerange[1] > 2 * mass * 9.81 * lever
-
-
 def test_a_character_may_have_a_file_of_its_own(tmp_path):
     (tmp_path / "mine.xml").write_text(BODY.format(**GOOD))
     mine = Character("mine", feet=("left_leg", "right_leg"), key_bodies=(), carrier=None, file=tmp_path / "mine.xml")
     assert mine.check() == []
     assert mine.spec().compile().nu == 2
+
+
+def test_sides_may_have_other_names():
+    body = BODY.format(**GOOD | {"right": "FR_leg"}).replace("left_leg", "FL_leg")
+    spec = mujoco.MjSpec.from_string(body)
+    (violation,) = violations(spec, feet=["FR_leg", "FL_leg"])
+    assert "no body's name begins or ends with a side (right_:left_)" in str(violation)
+    assert violations(spec, feet=["FR_leg", "FL_leg"], sides=(("FR_", "FL_"),)) == []
+
+
+STRADDLER = """
+<mujoco>
+  <option timestep="0.008333333333" integrator="implicitfast"/>
+  <worldbody>
+    <body name="root" pos="0 0 0.35"><freejoint/>
+      <geom type="box" size="0.1 0.1 0.05" mass="10" contype="0"/>
+      <body name="left_leg"><joint name="left_leg" axis="1 0 0" damping="5"/>
+        <geom type="box" size="0.2 0.02 0.02" pos="0 0.3 -0.33" contype="0" priority="1" condim="1"/>
+      </body>
+      <body name="right_leg"><joint name="right_leg" axis="1 0 0" damping="5"/>
+        <geom type="box" size="0.2 0.02 0.02" pos="0 -0.3 -0.33" contype="0" priority="1" condim="1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="left_leg" joint="left_leg" kp="500" ctrlrange="-1 1" forcerange="-{torque} {torque}"/>
+    <position name="right_leg" joint="right_leg" kp="500" ctrlrange="-1 1" forcerange="-{torque} {torque}"/>
+  </actuator>
+</mujoco>
+"""
+"""Two legs that spread sideways, on ice, which bear ten kilograms 0.3 m beside their hinges."""
+
+
+@pytest.mark.parametrize(("torque", "failures"), [(3 * 5 * 9.81 * 0.3, 0), (0.5 * 5 * 9.81 * 0.3, 1)])
+def test_a_body_has_to_hold_its_rest_pose(torque, failures):
+    found = violations(mujoco.MjSpec.from_string(STRADDLER.format(torque=torque)), feet=["left_leg", "right_leg"])
+    assert [violation.finding.partition(": ")[0] for violation in found] == ["does not hold its rest pose"] * failures

@@ -89,7 +89,7 @@ def test_a_file_too_large_to_be_a_motion_is_not_parsed(write, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"character": "trex"}, "character='trex' has not the joints of a human body"),
+        ({"character": "dodo"}, "character='dodo' does not exist: pass one of"),
         ({"rate": 0}, "rate=0 leaves less than two frames"),
         ({"rate": 1e9}, "rate=1000000000.0 leaves less"),
         ({"fps": float("nan")}, "fps=nan is no frame rate"),

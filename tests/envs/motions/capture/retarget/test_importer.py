@@ -25,7 +25,7 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
         ({"skip": 3}, "skip=3 leaves less than two frames of 4"),
         ({"skip": -1}, "skip=-1 leaves"),
         ({"rest_frame": 4}, r"rest_frame=4 does not exist: pass one of 0\.\.3"),
-        ({"character": "trex"}, "character='trex' has not the joints of a human body"),
+        ({"bodies": {"chest": "chest"}}, "bodies do not apply to character=humanoid, whose parts are known"),
     ],
 )
 def test_arguments_out_of_range_are_named(load, options, message):

@@ -1,0 +1,310 @@
+"""Bodies made for other purposes become characters: torques and gains, pose, root, feet, sides, and what is refused."""
+
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from torchrl_mcp.envs import Heading
+from torchrl_mcp.envs.characters import CHARACTERS, Character
+from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, key_bodies
+from torchrl_mcp.envs.characters.contract import lowest_bodies, violations
+from torchrl_mcp.envs.characters.drives import LIMIT_ANGLE
+from torchrl_mcp.envs.characters.sides import guessed_sides, twin
+
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+ROBOT = """
+<mujoco>
+  {option}
+  <worldbody>{scenery}
+    <body name="trunk" pos="0 0 1"><freejoint/>
+      <geom name="belly" type="box" size="0.1 0.15 0.1" mass="{mass}"/>
+      <body name="right_thigh" pos="0 -0.1 0"><joint name="right_hip" axis="0 1 0" range="-1.5 1.5" {hip}/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04" mass="1"/>
+        <body name="right_shin" pos="0 0 -0.4"><joint name="right_knee" axis="0 1 0" range="{bent}" {knee}/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="0.5"/>
+          <geom name="right_sole" type="box" pos="0.05 0 -0.35" size="0.15 0.05 0.05" mass="0.5"/>
+        </body>
+      </body>
+      <body name="left_thigh" pos="0 0.1 0"><joint name="left_hip" axis="0 1 0" range="-1.5 1.5" {hip}/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04" mass="1"/>
+        <body name="left_shin" pos="0 0 -0.4"><joint name="left_knee" axis="0 1 0" range="{bent}" {knee}/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="0.5"/>
+          <geom name="left_sole" type="box" pos="0.05 0 -0.35" size="0.15 0.05 0.05" mass="0.5"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>{actuators}</actuator>
+  <keyframe><key name="crouch" qpos="3 2 1 1 0 0 0 -0.5 1 -0.5 1"/></keyframe>
+</mujoco>
+"""
+PLAIN = {"option": "", "scenery": "", "mass": 30, "hip": "", "knee": "", "bent": "-0.1 2", "actuators": ""}
+SERVOS = "".join(
+    f'<position joint="{side}_{joint}" kp="500" kv="20" ctrlrange="-2 2"/>'
+    for side in ("right", "left")
+    for joint in ("hip", "knee")
+)
+
+
+def robot(**changes):
+    return mujoco.MjModel.from_xml_string(ROBOT.format(**PLAIN | changes))
+
+
+@pytest.fixture(scope="module")
+def gymnast():
+    before = mujoco.MjModel.from_xml_path(str(ASSETS / "humanoid.xml"))
+    return before, adapted(before, pose=["knee=-0.035"])
+
+
+def test_gymnasiums_humanoid_becomes_a_character_that_cannot_stand_still(gymnast):
+    _, body = gymnast
+    model = body.spec.compile()
+    lowest, feet = lowest_bodies(model)
+    assert (body.root, list(body.feet), body.sides) == ("torso", feet, (("right_", "left_"),))
+    assert feet == ["right_foot", "left_foot"]
+    assert lowest == pytest.approx(0, abs=1e-9)
+    (violation,) = violations(body.spec, feet=feet, key_bodies=key_bodies(model))  # it has no ankles
+    assert violation.finding.startswith("does not hold its rest pose: it topples after 1.")
+
+
+def test_adapting_keeps_masses_inertias_and_shapes(gymnast):
+    before, after = gymnast[0], gymnast[1].spec.compile()
+    for name in ("body_mass", "body_inertia", "body_ipos"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-12)
+    np.testing.assert_allclose(after.geom_size, before.geom_size[1:])  # the first is the floor
+
+
+def test_servos_hold_the_torques_of_motors_and_reach_them_at_the_angle_stated(gymnast):
+    before, after = gymnast[0], gymnast[1].spec.compile()
+    motor, servo = before.actuator("right_elbow"), after.actuator("right_lower_arm")
+    assert servo.forcerange[1] == pytest.approx(motor.gear[0] * motor.ctrlrange[1])
+    assert servo.gainprm[0] * LIMIT_ANGLE == pytest.approx(servo.forcerange[1])
+
+
+def test_the_ranges_of_a_balls_targets_hold_those_of_its_hinges(gymnast):
+    before, after = gymnast[0], gymnast[1].spec.compile()
+    for axis in "xyz":
+        low, high = before.joint(f"right_hip_{axis}").range
+        ends = after.actuator(f"right_thigh_{axis}").ctrlrange
+        assert ends[0] <= low
+        assert ends[1] >= high
+
+
+@pytest.mark.parametrize(
+    ("changes", "torque", "gain"),
+    [
+        ({"knee": 'actuatorfrcrange="-139 139"', "actuators": SERVOS}, (139, "file"), (500, "file")),
+        ({"actuators": SERVOS.replace("ctrl", 'forcerange="-90 90" ctrl')}, (90, "file"), (500, "file")),
+        (
+            {"knee": 'actuatorfrcrange="-50 50"', "actuators": SERVOS.replace("ctrl", 'forcerange="-90 90" ctrl')},
+            (50, "file"),
+            (500, "file"),
+        ),
+        ({"actuators": SERVOS.replace("kp", 'gear="2" kp')}, None, (4 * 500, "file")),
+        ({"actuators": '<motor joint="right_knee" gear="30" ctrlrange="-1 2"/>'}, (60, "file"), None),
+        ({"knee": 'actuatorfrcrange="-50 50"'}, (50, "file"), None),
+    ],
+)
+def test_torques_and_gains_are_those_of_the_file(changes, torque, gain):
+    drive = adapted(robot(**changes)).drives["right_shin"]
+    assert torque is None or (drive.torque, drive.torque_from) == torque
+    assert gain is None or (drive.gain, drive.gain_from) == gain
+    assert None not in (torque, gain) or "guessed" in (drive.torque_from, drive.gain_from)
+
+
+def test_the_written_servo_has_the_drive_that_is_reported():
+    body = adapted(robot(knee='actuatorfrcrange="-139 139"', actuators=SERVOS))
+    servo = body.spec.compile().actuator("right_shin")
+    assert (servo.gainprm[0], -servo.biasprm[1], -servo.biasprm[2]) == (500, 500, 20)
+    assert servo.forcerange.tolist() == [-139, 139]
+
+
+def test_a_leg_without_motors_can_carry_the_weight_above_it():
+    drive = adapted(robot()).drives["right_shin"]
+    above = 9.81 * (30 + 2 * (1 + 0.5 + 0.5) - 1)  # all but this shin with its sole, on one leg
+    lever = np.linalg.norm([0.2, 0.05, 0.4])  # from the knee to the corner of the sole
+    assert (drive.torque_from, drive.gain_from) == ("guessed", "guessed")
+    assert drive.torque == pytest.approx(above * lever)
+
+
+def test_a_guessed_gain_is_twice_that_at_which_gravity_topples_what_a_leg_carries():
+    model = robot(knee='actuatorfrcrange="-1 1"')
+    posed = mujoco.MjData(model)
+    mujoco.mj_forward(model, posed)
+    shin = model.body("right_shin").id
+    mass, total = model.body_subtreemass[[shin, 1]]
+    above = (total * posed.subtree_com[1, 2] - mass * posed.subtree_com[shin, 2]) / (total - mass) - 0.6
+    drive = adapted(model).drives["right_shin"]
+    assert drive.gain == pytest.approx(2 * (total - mass) * 9.81 * above / 2)  # on two feet
+
+
+def test_an_arm_without_a_motor_can_hold_three_times_what_hangs_on_it():
+    arm = '<joint name="arm" axis="0 1 0"/><geom size="0.02" pos="0.5 0 0" mass="2"/>'
+    body = f'<body name="arm" pos="0 0 0.1">{arm}</body>'
+    text = ROBOT.format(**PLAIN).replace('<body name="right_thigh"', f'{body}<body name="right_thigh"')
+    text = text.replace('qpos="3 2 1 1 0 0 0 ', 'qpos="3 2 1 1 0 0 0 0 ')
+    assert adapted(mujoco.MjModel.from_xml_string(text)).drives["arm"].torque == pytest.approx(3 * 2 * 9.81 * 0.5)
+
+
+def test_the_user_may_give_torques_and_gains_by_patterns_of_which_the_last_wins():
+    torques, gains = {".": 10.0, "knee": 139.0, "left_shin": 5.0}, {"hip|thigh": 321.0}
+    drives = adapted(robot(actuators=SERVOS), torques=torques, gains=gains).drives
+    assert {name: drive.torque for name, drive in drives.items()} == {
+        "right_thigh": 10,
+        "right_shin": 139,
+        "left_thigh": 10,
+        "left_shin": 5,
+    }
+    assert [(drive.gain, drive.gain_from) for drive in drives.values()] == [(321, "given"), (500, "file")] * 2
+
+
+@pytest.mark.parametrize("option", ["torque", "gain"])
+def test_a_pattern_that_matches_nothing_is_refused(option):
+    with pytest.raises(ValueError, match=rf"--{option} ankle=50 matches no joint: they are right_thigh, right_shin"):
+        adapted(robot(), **{f"{option}s": {"ankle": 50.0}})
+
+
+def test_what_resists_a_joint_is_kept_and_what_is_raised_is_named():
+    resisted = 'stiffness="7" springref="10" frictionloss="0.3" damping="4" armature="0.001"'
+    body = adapted(robot(knee=resisted, actuators=SERVOS))
+    joint, drive = body.spec.compile().joint("right_shin"), body.drives["right_shin"]
+    assert (joint.stiffness[0], joint.damping[0]) == (7, 4)
+    assert joint.frictionloss[0] == pytest.approx(0.3)
+    assert joint.qpos_spring[0] == pytest.approx(np.radians(10))
+    assert joint.armature[0] > 0.001
+    assert drive.remark == "armature 0.001 raised"
+    assert adapted(robot(knee='armature="1"', actuators=SERVOS)).drives["right_shin"].armature == 1
+
+
+def test_ranges_are_kept_and_a_rest_pose_beyond_them_is_refused():
+    assert adapted(robot()).ranges["right_shin"] == pytest.approx((np.radians(-0.1), np.radians(2)))
+    with pytest.raises(ValueError, match=r"beyond the range in radians of right_knee \(-2.82 to -0.89\), left_knee \("):
+        adapted(robot(bent=f"{np.degrees(-2.82)} {np.degrees(-0.89)}"))
+
+
+POSES = {"a keyframe": ["crouch"], "angles": ["hip=-0.5", "knee=1"], "both": ["crouch", "hip=-0.5"]}
+
+
+@pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
+def test_the_rest_pose_can_be_a_keyframe_or_angles(pose):
+    wide = robot(bent="-10 150")
+    wide.jnt_range[1:] = [-2.0, 2.0]
+    body = adapted(wide, pose=pose)
+    model, data, source = body.spec.compile(), mujoco.MjData(body.spec.compile()), mujoco.MjData(wide)
+    mujoco.mj_kinematics(model, data)
+    source.qpos[:] = wide.key_qpos[0]
+    mujoco.mj_kinematics(wide, source)
+    np.testing.assert_allclose(model.qpos0[7:], [-0.5, 1, -0.5, 1])
+    np.testing.assert_allclose(data.xpos[1:] - data.xpos[1], source.xpos[1:] - source.xpos[1], atol=1e-12)
+    np.testing.assert_allclose(data.xpos[1, :2], 0)
+
+
+def test_the_action_zero_is_the_rest_pose(tmp_path, monkeypatch):
+    wide = robot(bent="-10 150", actuators=SERVOS)
+    wide.jnt_range[1:] = [-2.0, 2.0]
+    body = adapted(wide, pose=["crouch"])
+    body.spec.compile()
+    (tmp_path / "croucher.xml").write_text(body.spec.to_xml())
+    croucher = Character("croucher", body.feet, (), None, tmp_path / "croucher.xml")
+    monkeypatch.setitem(CHARACTERS, "croucher", croucher)
+    env = Heading("croucher", num_envs=1, seed=0)
+    env.step(env.reset().set("action", torch.zeros(1, 4)))
+    np.testing.assert_allclose(env.simulation.state["ctrl"][0], [-0.5, 1, -0.5, 1], atol=1e-9)
+    env.step(env.reset().set("action", torch.full((1, 4), 0.1)))
+    np.testing.assert_allclose(
+        env.simulation.state["ctrl"][0], np.add([-0.5, 1, -0.5, 1], 0.1 * BEYOND * 2.0), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (["kneel"], "--pose kneel is no keyframe of the file: its keyframes are crouch"),
+        (["ankle=1"], "--pose ankle=1 matches no hinge: they are right_hip, right_knee, left_hip, left_knee"),
+        (["knee=bent"], "--pose knee=bent: 'bent' is no angle in radians"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(pose, message):
+    with pytest.raises(ValueError, match=message):
+        adapted(robot(), pose=pose)
+
+
+BALL = '<body name="ball" pos="2 0 1"><freejoint/><geom size="0.1"/></body>'
+
+
+def test_the_root_is_the_body_that_carries_most_or_the_one_that_is_named():
+    model = robot(scenery=BALL)
+    model = mujoco.MjModel.from_xml_string(
+        ROBOT.format(**PLAIN | {"scenery": BALL}).replace('"3 2 1', '"2 0 1 1 0 0 0 3 2 1')
+    )
+    body = adapted(model)
+    assert (body.root, body.left_out) == ("trunk", ("ball",))
+    assert adapted(model, root="trunk").root == "trunk"
+    with pytest.raises(ValueError, match="there is no body chest for the root: name one of ball, trunk, right_thigh"):
+        adapted(model, root="chest")
+
+
+def test_a_root_without_joint_gets_a_free_joint():
+    text = ROBOT.format(**PLAIN).replace("<freejoint/>", "").replace("3 2 1 1 0 0 0 ", "")
+    model = adapted(mujoco.MjModel.from_xml_string(text)).spec.compile()
+    assert model.jnt_type.tolist() == [0, 3, 3, 3, 3]
+
+
+def test_a_root_that_lies_on_the_ground_is_refused():
+    ant = mujoco.MjModel.from_xml_path(str(ASSETS / "ant.xml"))
+    with pytest.raises(ValueError, match="the rest pose is beyond the range in radians of ankle_1"):
+        adapted(ant)
+    ant.jnt_limited[:] = 0
+    with pytest.raises(ValueError, match="torso, the root, is lowest in the rest pose: choose one that stands on feet"):
+        adapted(ant)
+    assert adapted(ant, feet=["torso"]).feet == ("torso",)
+    standing = adapted(ant, pose=["ankle_[14]=1", "ankle_[23]=-1"])
+    assert standing.feet == ("body_4", "body_7", "body_10", "body_13")
+    with pytest.raises(ValueError, match="there is no body hoof for the feet"):
+        adapted(ant, feet=["hoof"])
+
+
+SLIDE = ROBOT.format(**PLAIN).replace('name="right_knee"', 'type="slide" name="right_knee"')
+
+
+def test_a_slide_joint_is_refused():
+    with pytest.raises(ValueError, match="right_shin has a joint that is neither hinge nor ball: replace or weld it"):
+        adapted(mujoco.MjModel.from_xml_string(SLIDE))
+
+
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_what_is_written_can_be_read_however_small(size):
+    """A rod's principal moments are a, a and nearly 0, which rounding makes impossible."""
+    model = robot()
+    model.body_mass *= size**3
+    model.body_inertia[2] = size**5 * np.array([0.01, 0.01 - 1e-9, 1e-9])
+    body = adapted(model)
+    body.spec.compile()
+    again = mujoco.MjModel.from_xml_string(body.spec.to_xml())
+    np.testing.assert_allclose(
+        again.body_inertia[2], model.body_inertia[2], rtol=1e-4, atol=1.2e-4 * 0.01 * size**5 + 1e-10
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "sides"),
+    [
+        (["trunk", "FR_hip", "FL_hip", "RR_hip", "RL_hip"], (("FR_", "FL_"), ("RR_", "RL_"))),
+        (["thorax", "coxa_T1_left", "coxa_T1_right"], (("_right", "_left"),)),
+        (["root", "right_leg", "left_leg"], (("right_", "left_"),)),
+        (["root", "right_leg", "left_arm"], ()),
+        (["root", "toe_R", "toe_L", "R_ear"], (("_R", "_L"),)),
+    ],
+)
+def test_sides_are_guessed_where_names_come_in_pairs(names, sides):
+    assert guessed_sides(names) == sides
+
+
+def test_a_twin_is_the_same_part_on_the_other_side():
+    sides = (("FR_", "FL_"), ("_R", "_L"))
+    names = ["FR_calf", "FL_calf", "toe_R", "toe_L", "trunk"]
+    assert [twin(name, sides) for name in names] == ["FL_calf", "FR_calf", "toe_L", "toe_R", "trunk"]
