@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.actor import Composition
+from torchrl_mcp.methods.mcp import DeterministicAction
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class GatesInARow(TensorDictModuleBase):
         if crossfade < 0:
             raise ValueError(f"crossfade={crossfade} is negative: pass seconds")
         self.env, self.acts, self.activation = env, tuple(acts), gate_activation
-        self.distribution_class = distribution_class
+        self.composite = DeterministicAction(distribution_class)
         self.rate = min(1.0, env.control_timestep / crossfade) if crossfade else 1.0
         self.act = torch.zeros(env.num_envs, dtype=torch.long)
         self.shares = torch.zeros(env.num_envs, len(acts))
@@ -80,8 +81,7 @@ class GatesInARow(TensorDictModuleBase):
         state = parts["observation_normaliser"](tensordict["observation"])
         gates = torch.stack([self._gates(act, state, tensordict["goal"]) for act in self.acts], -1)  # (N, K, acts)
         tensordict["gates"] = (gates @ self.shares.unsqueeze(-1)).squeeze(-1)
-        composite = self.distribution_class(*parts["primitives"](state), tensordict["gates"])
-        tensordict["action"] = composite.deterministic_sample
+        tensordict["action"] = self.composite(*parts["primitives"](state), tensordict["gates"])
         return tensordict
 
     def _advance(self) -> None:

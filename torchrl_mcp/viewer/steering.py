@@ -158,7 +158,7 @@ class Steering:
     def step(self) -> None:
         """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
-        held = {"direction": self.direction, "speed": self.speed}
+        held: dict[str, float | tuple[float, float] | None] = {"direction": self.direction, "speed": self.speed}
         if self.place is not None and isinstance(env, Location):
             held |= {"target": self.place, "seconds_left": math.inf}
         elif self.place is not None:
