@@ -90,6 +90,19 @@ def test_a_gate_acts_as_its_run_does_without_holding_the_primitives(run, library
         assert torch.equal(agent.parts["primitives"].state_dict()[name], parameter)
 
 
+def test_a_gate_that_began_as_another_gate_leaves_out_the_same_parts(run, tmp_path):
+    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={tmp_path / 'next'}"]
+    settings += ["method=mcp", "task=location", "stage=transfer", f"pretrained={run}", "width=1"]
+    settings += ["gating.network.width=0.1", "critic.width=0.1"]
+    settings += ["transfer.keep=[primitives,observation_normaliser,gating]"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        experiment.train(compose("train", settings))
+    gate = tmp_path / "gate.torchrl"
+    policies.publish_run(tmp_path / "next", gate)
+    assert set(checkpoint.shared(gate)) == {"primitives", "observation_normaliser"}
+    torch.testing.assert_close(act(gate), act(tmp_path / "next"), atol=0.02, rtol=0)
+
+
 def test_a_gate_has_a_name_that_commands_take(library, monkeypatch, capsys):
     path = builtin.locate("builtin:biped-heading")
     assert path == builtin.builtin("mcp", "biped", "heading") == library / "mcp-biped-heading.torchrl"

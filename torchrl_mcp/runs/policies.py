@@ -66,7 +66,7 @@ def restore(
 def publish_run(path: Path, output: Path) -> None:
     """Write the policy of a run as a separate checkpoint file, as small as the built-in networks.
 
-    For a run that transferred from a built-in network, the file leaves out the network's frozen parts.
+    The file leaves out the frozen parts if a built-in network has the same, bit for bit.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
@@ -79,8 +79,12 @@ def publish_run(path: Path, output: Path) -> None:
     cfg.run_dir = cfg.run_root = "."  # older runs have the folder where they began, which is of no use to others
     parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name not in agent.spare_parts})
     shared: dict[str, str] = {}
-    if cfg.stage.name == "transfer" and cfg.pretrained == "builtin":
-        shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
+    if cfg.stage.name == "transfer":
+        try:
+            shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
+        except ValueError:  # other networks, which the file then holds
+            if cfg.pretrained == "builtin":
+                raise
     config = cast("dict[str, Any]", OmegaConf.to_container(cfg))
     names = {value: Path(value).name for value in places.outside(config).values()}  # without folders of this machine
     publish(parts, places.moved(config, names), output, shared=shared)
