@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import benchmark, experiment, policies
+from torchrl_mcp.runs import benchmark, policies, records
 
 BENCHMARKS = Path(conf.__file__).parent / "benchmark"
 CHARACTERS = {"ant", "biped", "humanoid", "trex"}
@@ -288,7 +288,7 @@ def test_a_benchmark_of_your_own_code_reads_its_runs_without_being_told_to_trust
         smoke(tmp_path / "runs", "method=scratch", "parts._target_=own_parts.parts")
         assert "the run is complete" in capsys.readouterr().out
     with pytest.raises(ValueError, match="pass --trust own_parts"):
-        experiment.run_config(next(tmp_path.rglob("config.yaml")).parent)
+        records.run_config(next(tmp_path.rglob("config.yaml")).parent)
 
 
 def needs_plugin(name):

@@ -27,8 +27,10 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import build, experiment, quoting
+from torchrl_mcp.runs import experiment, quoting, records
+from torchrl_mcp.runs.configuration import planned
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
+from torchrl_mcp.runs.requirements import require_environment
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.runs.trust import targets, trusting
 from torchrl_mcp.training.run_folder import CONFIG, LOG
@@ -179,12 +181,11 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     try:
         with read_write(cfg), open_dict(cfg):
             del cfg["hydra"]
-        build.require_valid(cfg)
-        build.require_environment(cfg)
-        config, folder = build.stored(experiment.settled(cfg)), Path(cfg.run_dir)
+        plan = planned(cfg)
+        require_environment(plan.cfg)
     finally:
         HydraConfig.instance().cfg = former
-    return Job(folder, overrides, config)
+    return Job(plan.folder, overrides, plan.config)
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:
@@ -207,7 +208,7 @@ def conflict(job: Job) -> str | None:
     """Return why a job cannot use its folder, or None."""
     if not (job.folder / CONFIG).exists():
         return None
-    if not (changed := experiment.changes(job.folder, job.config)):
+    if not (changed := records.changes(job.folder, job.config)):
         return None
     return f"{job.folder} differs in {', '.join(changed)}: keep it, and choose another run_root"
 
@@ -240,7 +241,7 @@ def run(cfg: DictConfig) -> None:
 
 def is_complete(folder: Path) -> bool:
     """Return whether a folder holds a finished and evaluated run."""
-    return (folder / CONFIG).exists() and experiment.is_complete(folder)
+    return (folder / CONFIG).exists() and records.is_complete(folder)
 
 
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:

@@ -13,7 +13,7 @@ from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build, places
+from torchrl_mcp.runs import places, requirements
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import translated
@@ -32,7 +32,7 @@ def policy_config(path: Path) -> DictConfig:
     """
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
-    build.require_known(config, file)
+    requirements.require_known(config, file)
     return OmegaConf.create(translated(config))
 
 
