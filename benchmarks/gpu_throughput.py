@@ -27,6 +27,7 @@ from typing import Any
 import torch
 from report import about, table, write
 
+from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs import build, configuration, requirements
 from torchrl_mcp.runs.builtin import builtin
@@ -135,8 +136,8 @@ def main() -> None:
         return
     try:
         for physics in ENGINES:
-            cfg = configuration.compose_run(f"device={arguments.device}", f"physics={physics}")
-            requirements.require_equipment(cfg)
+            requirements.require_equipment(configuration.compose_run(f"device={arguments.device}"))
+            Heading("biped", 1, physics=physics)
     except ValueError as error:
         parser.error(str(error))
     quick, threads = arguments.quick, arguments.threads

@@ -13,7 +13,7 @@ PROGRAM = "torchrl-mcp-train"
 
 GROUPS = (
     *("method", "task", "character", "stage", "motions", "imitation", "curriculum", "preset", "benchmark"),
-    *("mixer", "gating", "primitives", "exploration", "optimizer", "collector", "logger"),
+    *("mixer", "gating", "primitives", "exploration", "optimizer", "physics", "collector", "logger"),
 )
 """Groups of settings for the command line; the choices of other groups come with a method."""
 

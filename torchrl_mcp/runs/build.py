@@ -20,12 +20,7 @@ from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
-from torchrl_mcp.runs.requirements import (
-    require_arguments,
-    require_environment,
-    require_files,
-    simulates_on_device,
-)
+from torchrl_mcp.runs.requirements import require_arguments, require_environment, require_files
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter, begin_after
@@ -67,10 +62,10 @@ def make_run(cfg: DictConfig, folder: Path, initial: Path | None = None) -> Trai
 
 def make_source(cfg: DictConfig) -> TrajectorySource:
     """Return the configured source of trajectories."""
-    if simulates_on_device(cfg):
-        factory = partial(make_env, cfg, physics=cfg.physics, device=cfg.device)
-    else:
-        factory = partial(make_env, cfg, pin_memory=torch.device(cfg.device).type == "cuda")
+    place: dict[str, Any] = {"pin_memory": torch.device(cfg.device).type == "cuda"}
+    if cfg.physics.on_device:
+        place = {"device": cfg.device}
+    factory = partial(make_env, cfg, physics=instantiate(cfg.physics.engine), **place)
     return instantiate(cfg.collector)(factory, num_envs=cfg.training.num_envs, seed=cfg.seed)
 
 

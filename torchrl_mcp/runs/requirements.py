@@ -12,7 +12,6 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.envs.physics.engines import require_engine
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.trust import require_trusted, targets
@@ -98,18 +97,11 @@ def require_equipment(cfg: DictConfig) -> None:
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
             "build of torch on a machine with a GPU"
         )
-    if simulates_on_device(cfg):
-        require_engine(cfg.physics, torch.device(cfg.device))
-        if "num_workers" in cfg.collector:
-            raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
+    if cfg.physics.on_device and "num_workers" in cfg.collector:
+        raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
     kind = cfg.logger.logger_type if cfg.logger else "csv"
     if kind != "csv" and find_spec(kind) is None:
         raise ValueError(f"logger={kind} needs {kind}: pip install 'torchrl-mcp[{kind}]', or choose logger=tensorboard")
-
-
-def simulates_on_device(cfg: DictConfig) -> bool:
-    """Return whether training episodes are simulated on the networks' device; older runs lack the setting."""
-    return cfg.get("physics") == "warp"
 
 
 def require_known(config: Mapping[str, Any], source: Path) -> None:

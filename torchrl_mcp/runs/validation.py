@@ -95,7 +95,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind random_first_length restart_noise
+        terminate_when_unhealthy success_reward parts.blind on_device random_first_length restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
@@ -112,7 +112,6 @@ NAMES_BY_RULE: dict[Rule, str] = {
     _among(True, False, "auto"): "autocast",
     _among("any", "same"): "switch_to",
     _among("pyramidal", "elliptic"): "friction_cone",
-    _among("mujoco", "warp"): "physics",
     _among("metres", "logarithmic"): "goal_positions",
 }
 
