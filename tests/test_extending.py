@@ -110,7 +110,6 @@ transfer: {_target_: own_task.Wait, _partial_: true, character: "${character.nam
 from torch import nn
 
 from torchrl_mcp.methods.actor import input_normalisers
-from torchrl_mcp.modules import RunningNormaliser
 
 class Linear(nn.Module):
     def __init__(self, observation_dim, action_dim, std):
@@ -121,9 +120,9 @@ class Linear(nn.Module):
         loc = self.loc(observation)
         return loc, loc.new_full(loc.shape, self.std)
 
-def linear_parts(observation_dim, goal_dim, action_dim, *, std):
-    parts = nn.ModuleDict(input_normalisers(observation_dim, goal_dim, RunningNormaliser))
-    parts["policy"] = Linear(observation_dim, action_dim, std)
+def linear_parts(sizes, *, std):
+    parts = nn.ModuleDict(input_normalisers(sizes))
+    parts["policy"] = Linear(sizes.observation, sizes.action, std)
     return parts
 """,
             "own/method/linear.yaml": """

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
@@ -320,6 +321,13 @@ def test_the_slurm_launcher_composes_and_queues_again_what_reached_its_time_limi
     assert launcher["_target_"].endswith("SlurmLauncher")
     assert launcher.partition == "long"
     assert launcher.max_num_timeout > 0
+
+
+def test_a_plan_refers_to_hydra_for_the_names_of_folders_and_leaves_it_as_it_was():
+    former = HydraConfig.instance().cfg
+    (*_, job) = jobs_of("benchmark=smoke", "method=scratch", "lmbda=0.5")
+    assert "lmbda-0.5" in str(job.folder)
+    assert HydraConfig.instance().cfg is former
 
 
 def test_rows_with_numbers_are_selected_by_the_command_line():

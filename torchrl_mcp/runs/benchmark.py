@@ -9,7 +9,7 @@ refuses folders with other settings.
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -176,16 +176,27 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     """Return the run with these settings, in its configured folder."""
     overrides = [f"{key}={value}" for key, value in {**settings, "progress_bar": "false"}.items()]
     cfg = loader.load_sweep_config(master, overrides)
-    former = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(cfg)  # interpolations may refer to it
-    try:
+    with _current(cfg):
         with read_write(cfg), open_dict(cfg):
             del cfg["hydra"]
         plan = planned(cfg)
         require_environment(plan.cfg)
-    finally:
-        HydraConfig.instance().cfg = former
     return Job(plan.folder, overrides, plan.config)
+
+
+@contextmanager
+def _current(cfg: DictConfig) -> Iterator[None]:
+    """Let ``${hydra:...}`` refer to a configuration while the block runs.
+
+    Hydra documents how to set it, but has no function to return to the former one: its own jobs assign ``cfg``, too.
+    """
+    hydra = HydraConfig.instance()
+    former = hydra.cfg
+    hydra.set_config(cfg)
+    try:
+        yield
+    finally:
+        hydra.cfg = former
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:

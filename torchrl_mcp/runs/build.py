@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.envs import Compose
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.methods.actor import Actor
+from torchrl_mcp.methods.actor import Actor, Sizes
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
@@ -96,8 +96,9 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
         ValueError: If the parts that transfer keeps or freezes are unknown or do not go together, or the file does not
             fit.
     """
-    sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
-    parts = instantiate(cfg.parts)(sizes["observation"], sizes["goal"], env.action_spec.shape[-1])
+    seen = env.observation_spec
+    sizes = Sizes(seen["observation"].shape[-1], seen["goal"].shape[-1], env.action_spec.shape[-1])
+    parts = instantiate(cfg.parts)(sizes)
     names: Sequence[str] = ()
     if cfg.stage.name == "transfer":
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
@@ -109,7 +110,7 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
         require_frozen_input(parts, cfg.transfer.keep, names)
     frozen = FrozenParts(parts, names)
     actor = instantiate(cfg.actor)(parts, frozen=names)
-    critic = instantiate(cfg.critic)(parts, sizes["observation"], sizes["goal"])
+    critic = instantiate(cfg.critic)(parts, sizes)
     if cfg.stage.name == "pretrain" and pretrained is not None:
         checkpoint.load_agent(parts, pretrained)
     parts.to(cfg.device)
