@@ -173,9 +173,7 @@ def test_who_may_what(path, host, origin, address, refused):
 
 def test_no_page_is_opened_by_a_version_of_mujoco_that_nobody_has_tried(monkeypatch):
     monkeypatch.setattr(mujoco, "__version__", "3.18.0")
-    with pytest.raises(
-        RuntimeError, match=r"MuJoCo 3\.18\.0 is not known: install mujoco 3\.17"
-    ):
+    with pytest.raises(RuntimeError, match=r"MuJoCo 3\.18\.0 is not known: install mujoco 3\.17"):
         play_in_browser(Brief(), port=0)
 
 
