@@ -132,6 +132,6 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
     ids=lambda path: path.stem,
 )
 def test_what_comes_with_the_library_follows_its_motions(path):
-    results = policies.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
+    results = policies.evaluation(path, episodes=8, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25
     assert results["deterministic"]["metrics"]["tracking_error"] < 0.15

@@ -11,22 +11,18 @@ end_with_parent_while_starting()  # before the imports that take a worker second
 PROGRAM = "torchrl-mcp-train"
 
 GROUPS = {
-    "method": "",
+    **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
     "task": "imitation to pre-train, holdout in both stages, the others to transfer",
     "character": "ant for holdout, any other for the other tasks",
     "stage": "transfer needs pretrained=, for every method but scratch",
     "preset": "fast learns best here, paper has Tables 5 to 11, comparison the same steps for every method",
     "benchmark": "many runs of several methods",
-    "mixer": "",
-    "gating": "",
-    "primitives": "",
     "exploration": "action samples the composite action, weights the gate; MCP takes weights at transfer",
     "curriculum": "training episodes: none for those of the evaluation, mixed for easier ones",
     "motions": "references of imitation",
     "imitation": "reward of imitation",
-    "optimizer": "",
     "physics": "engine of training episodes; warp computes on the GPU, with device=cuda and torchrl-mcp[warp]",
-    "collector": "",
+    **dict.fromkeys(("collector", "optimizer"), ""),
     "logger": "beside metrics.csv",
 }
 """Groups of settings for the command line and what they say; the choices of other groups come with a method."""

@@ -11,11 +11,7 @@ from torchrl_mcp.modules.gating import scaled_cells
 
 
 def value_critic(
-    parts: nn.ModuleDict,
-    sizes: Sizes,
-    *,
-    num_cells: Sequence[int] = (1024, 512),
-    width: float = 1.0,
+    parts: nn.ModuleDict, sizes: Sizes, *, num_cells: Sequence[int] = (1024, 512), width: float = 1.0
 ) -> TensorDictSequential:
     """Add the part ``critic``, V(s, g), and return it as a module from ``observation`` and ``goal`` to ``state_value``.
 

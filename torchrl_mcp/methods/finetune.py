@@ -29,12 +29,7 @@ from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Sizes, input_normalise
 from torchrl_mcp.modules.injection import InjectedPolicy, InputInjection
 
 
-def injected_parts(
-    sizes: Sizes,
-    *,
-    policy: Callable[[int, int], InjectedPolicy],
-    blind: bool,
-) -> nn.ModuleDict:
+def injected_parts(sizes: Sizes, *, policy: Callable[[int, int], InjectedPolicy], blind: bool) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``policy`` and ``goal_input``.
 
     Args:

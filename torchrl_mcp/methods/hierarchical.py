@@ -12,12 +12,7 @@ from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, Sizes, input_normal
 from torchrl_mcp.methods.options import OptionActor, RandomSequence, WhereBeginning, keep_option
 
 
-def primitive_parts(
-    sizes: Sizes,
-    *,
-    primitives: Callable[..., nn.Module],
-    num_options: int,
-) -> nn.ModuleDict:
+def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: int) -> nn.ModuleDict:
     """Make the parts of pre-training: ``observation_normaliser``, ``goal_normaliser`` and ``primitives``.
 
     Args:
@@ -34,11 +29,7 @@ def primitive_parts(
 
 
 def gated_parts(
-    sizes: Sizes,
-    *,
-    gating: Callable[..., nn.Module],
-    primitives: Callable[..., nn.Module],
-    num_options: int,
+    sizes: Sizes, *, gating: Callable[..., nn.Module], primitives: Callable[..., nn.Module], num_options: int
 ) -> nn.ModuleDict:
     """Make the parts of transfer: the parts of :func:`primitive_parts` and ``gating``.
 
@@ -104,15 +95,7 @@ def gated_actor(
 def random_sequence(
     parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
 ) -> Explorer:
-    """Return an explorer that lets one primitive act after another in random order.
-
-    Args:
-        parts: Made by :func:`primitive_parts`.
-        num: Number of simulations, ``N``.
-        generator: Source of randomness.
-        num_options: Number of primitives, ``K``.
-        steps: Control steps for which each acts.
-    """
+    """Return a :class:`.RandomSequence` of the primitives in the parts of :func:`primitive_parts`."""
     return RandomSequence(parts["primitives"], num, generator, num_options=num_options, steps=steps)
 
 

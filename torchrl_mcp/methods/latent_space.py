@@ -33,11 +33,7 @@ LATENT = ("latent", "sample")
 
 
 def latent_parts(
-    sizes: Sizes,
-    *,
-    encoder: Callable[..., nn.Module],
-    decoder: Callable[..., nn.Module],
-    latent_dim: int,
+    sizes: Sizes, *, encoder: Callable[..., nn.Module], decoder: Callable[..., nn.Module], latent_dim: int
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``encoder`` and ``decoder``.
 

@@ -139,15 +139,7 @@ def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:
 def random_sequence(
     parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
 ) -> Explorer:
-    """Return an explorer that lets one option act after another in random order.
-
-    Args:
-        parts: Made by :func:`option_critic_parts`.
-        num: Number of simulations, ``N``.
-        generator: Source of randomness.
-        num_options: Number of options, ``K``.
-        steps: Control steps for which each acts.
-    """
+    """Return a :class:`.RandomSequence` of the options in the parts of :func:`option_critic_parts`."""
 
     def options(state: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = parts["options"](state)

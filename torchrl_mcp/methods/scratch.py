@@ -9,11 +9,7 @@ from torchrl.modules import IndependentNormal
 from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Sizes, input_normalisers, normalise_inputs, sampler
 
 
-def gaussian_parts(
-    sizes: Sizes,
-    *,
-    policy: Callable[..., nn.Module],
-) -> nn.ModuleDict:
+def gaussian_parts(sizes: Sizes, *, policy: Callable[..., nn.Module]) -> nn.ModuleDict:
     """Make the parts of the scratch model: ``observation_normaliser``, ``goal_normaliser`` and ``policy``.
 
     Args:

@@ -190,13 +190,12 @@ def _current(cfg: DictConfig) -> Iterator[None]:
 
     Hydra documents how to set it, but has no function to return to the former one: its own jobs assign ``cfg``, too.
     """
-    hydra = HydraConfig.instance()
-    former = hydra.cfg
-    hydra.set_config(cfg)
+    former = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(cfg)
     try:
         yield
     finally:
-        hydra.cfg = former
+        HydraConfig.instance().cfg = former
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:

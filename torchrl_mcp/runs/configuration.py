@@ -17,7 +17,7 @@ from torchrl_mcp.training import checkpoint
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will be, before anything is built or written.
+    """A run before anything is built or written.
 
     Attributes:
         cfg: The configuration, with the widths of loaded networks: of those that transfer keeps, else of all.

@@ -9,6 +9,9 @@ REMOVED = {"failure_weighting": 0.0, "shaping": {}}
 AIDS = ("initial_states", "mixture", "emphasis", "staggered", "discount")
 """Settings of environments that are one setting in this version, ``curriculum``."""
 
+ENGINES = {"mujoco": "mujoco_threads", "warp": "mujoco_warp"}
+"""Functions of engines by their names, which earlier versions wrote."""
+
 PLACES = ("pretrain", "transfer", "evaluation")
 """Groups of ``task`` that hold settings of environments."""
 
@@ -23,7 +26,8 @@ def translated(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     made = _without(config)
     if isinstance(engine := made.get("physics", "mujoco"), str):
-        made["physics"] = _physics(engine)
+        target = f"torchrl_mcp.envs.physics.engines.{ENGINES[engine]}"
+        made["physics"] = {"engine": {"_target_": target, "_partial_": True}, "on_device": engine == "warp"}
     if "task" in made:
         places = {name: _with_curriculum(made["task"][name]) for name in PLACES if name in made["task"]}
         made["task"] = made["task"] | places
@@ -44,13 +48,6 @@ def require_resumable(config: Mapping[str, Any]) -> None:
             f"the run is trained with {lost[0]}={stage[lost[0]]}, which this version lacks: resume it with the version "
             "that wrote it, whose commit is in the run folder's origin.json"
         )
-
-
-def _physics(engine: str) -> dict[str, Any]:
-    """Return the settings of an engine from its name, which was all that earlier versions wrote."""
-    maker = {"mujoco": "mujoco_threads", "warp": "mujoco_warp"}[engine]
-    target = f"torchrl_mcp.envs.physics.engines.{maker}"
-    return {"engine": {"_target_": target, "_partial_": True}, "on_device": engine == "warp"}
 
 
 def _without(value: Any) -> Any:

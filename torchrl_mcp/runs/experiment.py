@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import build, lock, places, records
 from torchrl_mcp.runs.configuration import Plan, initial_networks, planned
+from torchrl_mcp.runs.earlier import require_resumable
 from torchrl_mcp.runs.policies import evaluation
 from torchrl_mcp.runs.records import is_complete
 from torchrl_mcp.runs.requirements import require_all
@@ -100,7 +101,8 @@ def _train(plan: Plan) -> Path:
 def _resume(folder: Path, device: str | None) -> Path:
     if is_complete(folder):
         return folder
-    cfg = records.resumable_config(folder)
+    require_resumable(read_config(folder / CONFIG))
+    cfg = records.run_config(folder)
     cfg.device = device or cfg.device
     require_all(cfg)
     print(f"{folder} goes on{records.elsewhere(folder, cfg)}", flush=True)

@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import places
-from torchrl_mcp.runs.earlier import require_resumable, translated
+from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import continuation, provenance
@@ -118,16 +118,6 @@ def change(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> 
     if total > planned:
         frames = run_folder.frames(checkpoint.find(folder))
         write_json(continuation(_origin(folder), planned, total, frames), folder / PROVENANCE)
-
-
-def resumable_config(folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder``, after checking that this version can train it further.
-
-    Raises:
-        ValueError: As :func:`run_config`, or if this version lacks what the run was trained with.
-    """
-    require_resumable(read_config(folder / CONFIG))
-    return run_config(folder)
 
 
 def require_same_run(cfg: DictConfig, path: Path) -> None:

@@ -6,9 +6,8 @@ component, so that transfer can load only the parts that it keeps.
 """
 
 import zlib
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
-from logging import WARNING, LogRecord
+from collections.abc import Collection, Mapping
+from logging import ERROR
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -78,17 +77,21 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint file {path}")
+    level = torchrl_logger.level
+    torchrl_logger.setLevel(ERROR)  # it also warns of another build of a version, as for CUDA
     try:
         _require_plain_data(path)
-        with _without_warnings():
-            report = checkpoint.load(path, components=components, map_location="cpu")
+        report = checkpoint.load(path, components=components, map_location="cpu")
     except UNREADABLE as error:
         raise ValueError(
             f"cannot restore {path}: {error}. The file is damaged or belongs to a different method, character, task or "
             "network size; give a checkpoint of the same configuration"
         ) from error
-    if other := _other_versions(report.comparison):
-        torchrl_logger.warning(f"{path} was written by other versions: {', '.join(other)}")
+    finally:
+        torchrl_logger.setLevel(level)
+    versions = report.comparison.get("versions", {})
+    if other := [name for name, pair in versions.items() if _plain(pair["checkpoint"]) != _plain(pair["runtime"])]:
+        torchrl_logger.warning(f"{path} was written with another version of {', '.join(other)}")
 
 
 def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None:
@@ -206,28 +209,9 @@ def _require_plain_data(path: Path) -> None:
             raise CheckpointError("it would unpack to more than its own size, which no checkpoint of torchrl-mcp does")
 
 
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Silence TorchRL's warnings while the block runs: it also warns of another build of a version, as for CUDA."""
-
-    def passes(record: LogRecord) -> bool:
-        return record.levelno != WARNING
-
-    torchrl_logger.addFilter(passes)
-    try:
-        yield
-    finally:
-        torchrl_logger.removeFilter(passes)
-
-
-def _other_versions(comparison: Mapping[str, Any]) -> list[str]:
-    """Return the libraries of another version than here, not those of another build, by TorchRL's comparison."""
-    pairs = {name: (pair["checkpoint"], pair["runtime"]) for name, pair in comparison.get("versions", {}).items()}
-    return [
-        f"{name} {there} (here {here})"
-        for name, (there, here) in pairs.items()
-        if str(there).partition("+")[0] != str(here).partition("+")[0]
-    ]
+def _plain(version: str) -> str:
+    """Return a version without its build, such as ``+cpu``."""
+    return version.partition("+")[0]
 
 
 def _component(part: str) -> str:
