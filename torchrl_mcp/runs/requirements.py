@@ -13,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import places
-from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.trust import require_trusted, targets
 
 
@@ -29,7 +28,7 @@ def require_all(cfg: DictConfig) -> None:
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
         raise ValueError(
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
-            f"give its run folder as pretrained=<folder>{_builtin_alternative(cfg)}"
+            "give its run folder as pretrained=<folder>, or take the library's own networks: pretrained=builtin"
         )
 
 
@@ -159,15 +158,6 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
             break
     return found
-
-
-def _builtin_alternative(cfg: DictConfig) -> str:
-    """Return a hint at ``pretrained=builtin``, if the library has networks of the method and the character."""
-    try:
-        builtin(cfg.method.name, cfg.character.name)
-    except ValueError:
-        return ""
-    return ", or take the networks that come with the library: pretrained=builtin"
 
 
 def _import(module: str, character: str) -> None:
