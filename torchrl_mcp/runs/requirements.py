@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import places
+from torchrl_mcp.runs.builtin import FOLDER
 from torchrl_mcp.runs.trust import require_trusted, targets
 
 
@@ -26,9 +27,11 @@ def require_all(cfg: DictConfig) -> None:
     require_files(cfg, cfg.task[cfg.stage.name])
     require_equipment(cfg)
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
+        ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
         raise ValueError(
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
-            "give its run folder as pretrained=<folder>, or take the library's own networks: pretrained=builtin"
+            "give its run folder as pretrained=<folder>"
+            + (", or take the networks that come with the library: pretrained=builtin" if ours else "")
         )
 
 
