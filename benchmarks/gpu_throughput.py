@@ -27,8 +27,9 @@ from typing import Any
 import torch
 from report import about, table, write
 
+from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, configuration, requirements
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.training.precision import choose
@@ -62,7 +63,7 @@ def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, 
         "width": 1.0,
         **{"logger": "none", "progress_bar": False, "run_dir": "."},
     }
-    cfg = build.compose_run(*(f"{name}={value}" for name, value in settings.items()))
+    cfg = configuration.compose_run(*(f"{name}={value}" for name, value in settings.items()))
     source = build.make_source(cfg)
     agent = build.make_agent(cfg, source.env, builtin("mcp", character) if stage == "transfer" else None)
     trainer = build.make_trainer(cfg, agent, source, Path(cfg.run_dir))
@@ -135,7 +136,8 @@ def main() -> None:
         return
     try:
         for physics in ENGINES:
-            build.require_equipment(build.compose_run(f"device={arguments.device}", f"physics={physics}"))
+            requirements.require_equipment(configuration.compose_run(f"device={arguments.device}"))
+            Heading("biped", 1, physics=physics)
     except ValueError as error:
         parser.error(str(error))
     quick, threads = arguments.quick, arguments.threads

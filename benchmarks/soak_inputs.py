@@ -18,7 +18,7 @@ from zipfile import ZipFile
 import torch
 
 from torchrl_mcp.envs.physics.simulation import LARGEST
-from torchrl_mcp.runs import build, experiment, policies
+from torchrl_mcp.runs import build, configuration, experiment, policies
 from torchrl_mcp.training import checkpoint
 
 SMALL = ("method=mcp", "task=holdout", "stage=pretrain", "preset=smoke", "width=0.0625", "autocast=false")
@@ -39,7 +39,7 @@ def contents(path: Path) -> Mapping[str, bytes]:
 def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Damage a checkpoint, and try to read it for a resume and for an evaluation."""
     with tempfile.TemporaryDirectory() as name:
-        cfg = build.compose_run(*SMALL, f"run_dir={name}/run", "logger=none", "progress_bar=false")
+        cfg = configuration.compose_run(*SMALL, f"run_dir={name}/run", "logger=none", "progress_bar=false")
         path, copy = checkpoint.find(experiment.train(cfg)), Path(name) / "damaged.torchrl"
         _, agent, _ = policies.restore(path, num_envs=1, seed=0)
         whole = {key: value.clone() for key, value in agent.parts.state_dict().items()}
@@ -76,7 +76,7 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     chosen = [(task, character) for task, character in TASKS if task in args.tasks]
     for task, character in chosen:
         stage = "pretrain" if task in ("holdout", "imitation") else "transfer"
-        cfg = build.compose_run(f"task={task}", f"character={character}", f"stage={stage}")
+        cfg = configuration.compose_run(f"task={task}", f"character={character}", f"stage={stage}")
         env = build.make_env(cfg, num_envs=num_envs, seed=0, num_threads=args.threads)
         generator, tally, before, began = torch.Generator().manual_seed(0), Counter[str](), warned(), time.monotonic()
         state = env.reset()

@@ -8,7 +8,8 @@ if __name__ != "torchrl_mcp.conf":
 
 from omegaconf import OmegaConf
 
-from torchrl_mcp.runs.identity import folder_name
+from torchrl_mcp.runs.identity import UNNAMED, folder_name
 
-# Hydra imports this package to read its files, so the resolver is there wherever they are.
+# Hydra imports this package to read its files, so the resolvers are there wherever they are.
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("unnamed", lambda: sorted(UNNAMED), replace=True)

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.physics.engines import make_simulation
+from torchrl_mcp.envs.physics.engines import Engine, named
 from torchrl_mcp.envs.physics.simulation import LARGEST
 from torchrl_mcp.envs.rendering.camera import Arrow, Camera
 
@@ -40,14 +40,15 @@ class CharacterEnv(EnvBase):
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
         episode: Task state of one simulation at the beginning of an episode, by name; stored as ``(N, ...)``.
-        outputs: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
-        model_fields: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
-        physics: The engine: ``"mujoco"``, threads on the CPU in float64, or ``"warp"``, MuJoCo Warp in float32.
+        outputs: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
+        model_fields: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
+        physics: The engine: ``"mujoco"``, threads on the CPU in float64, ``"warp"``, MuJoCo Warp in float32, or
+            another :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         device: Device of simulations, rewards and outputs; MuJoCo's threads need the CPU.
         seed: Seed of ``generator``, or None to draw one.
         num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
-        persistent: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
-        current: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
+        persistent: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
+        current: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         dtype: Type of the outputs; rewards are computed in float64, physics in the type of the engine.
         pin_memory: Return pinned tensors, which copy to a CUDA device without blocking. (Under transforms,
             TorchRL merges the outputs of a partial reset into new tensors, which are not pinned.)
@@ -69,7 +70,7 @@ class CharacterEnv(EnvBase):
         episode: Mapping[str, Tensor] = MappingProxyType({}),
         outputs: Sequence[str] = (),
         model_fields: Sequence[str] = (),
-        physics: str = "mujoco",
+        physics: str | Engine = "mujoco",
         device: torch.device | str = "cpu",
         seed: int | None = None,
         num_threads: int = 0,
@@ -91,10 +92,9 @@ class CharacterEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=[num_envs])
         self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
         self.control_timestep = substeps * model.opt.timestep
-        self.simulation = make_simulation(
+        self.simulation = named(physics)(
             model,
             num_envs,
-            physics=physics,
             device=self.device,
             substeps=substeps,
             outputs=outputs,

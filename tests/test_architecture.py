@@ -38,8 +38,8 @@ ROOMS = (
 )
 """Folders and modules of ``torchrl_mcp.envs``, of which each may import those before it."""
 ROOM_RANKS = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
-HYDRA = {"torchrl_mcp.runs.build", "torchrl_mcp.runs.benchmark"}
-"""Modules beside those of ``cli`` and ``commands`` that may import Hydra: one builds, one drives its launchers."""
+HYDRA = {f"torchrl_mcp.runs.{name}" for name in ("configuration", "provenance", "build", "benchmark")}
+"""Modules beside those of ``cli`` and ``commands`` that may import Hydra: composing, building, launching."""
 WITHOUT_HYDRA = {folder for folders in ORDER[:6] for folder in folders} | {"analysis", "viewer", "envs"}
 RESTORING = {"torchrl_mcp.analysis.checkpoints"}
 """Modules of theirs that restore runs, by way of ``runs.build``."""

@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs.build import require_environment
+from torchrl_mcp.runs.requirements import require_environment
 
 CONF = Path(conf.__file__).parent
 METHODS, CHARACTERS, STAGES = (

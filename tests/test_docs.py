@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.report.paper import TABLE_2
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, requirements
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -149,7 +149,7 @@ def exists(cfg, name):
         return False
     if not name.startswith("+"):
         return last in parent
-    return last not in parent and "_target_" in parent and last in build.arguments(parent._target_)
+    return last not in parent and "_target_" in parent and last in requirements.arguments(parent._target_)
 
 
 @pytest.mark.parametrize("page", pages_with(INCLUDE), ids=lambda path: path.stem)

@@ -96,8 +96,8 @@ def test_a_resumed_transfer_continues_to_the_same_numbers(runs, tmp_path):
 
 
 def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs):
-    results = policies.evaluate_run(runs[1], episodes=3, seed=0, max_episode_steps=5)
-    for numbers in results.values():
+    results = policies.evaluation(runs[1], episodes=3, seed=0, max_episode_steps=5)
+    for numbers in (results["deterministic"], results["stochastic"]):
         assert 1 <= numbers["length"] <= 5
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
     assert results["deterministic"]["return"] != results["stochastic"]["return"]

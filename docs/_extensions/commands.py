@@ -69,5 +69,5 @@ def name(action: argparse.Action) -> str:
 
 def meaning(action: argparse.Action) -> str:
     """Return the help of an argument for a cell of a table."""
-    text = (action.help or "").replace("%%", "%").replace("|", r"\|")
+    text = ((action.help or "") % vars(action)).replace("|", r"\|")
     return re.sub(r"(?<![`\w/])(--?[a-z][a-z-]*)", r"`\1`", text)

@@ -21,17 +21,8 @@ class BatchSimulation(Simulation):
     MuJoCo's default on divergence, a silent reset in the middle of a step, is switched off; its warnings still go to
     ``MUJOCO_LOG.TXT`` in the working directory. State and outputs are float64.
 
-    Args:
-        model: The compiled model; a copy is kept.
-        num_envs: Number N of simulations.
-        substeps: Physics steps per call of :meth:`step`.
-        num_threads: Threads; 0 takes one per processor. Results do not depend on it.
-        outputs: ``MjData`` fields to expose in addition to the sensors. After :meth:`step` they are one substep
-            behind the state, as after ``mj_step``; after :meth:`reset` they are current.
-        model_fields: ``MjModel`` fields of which every simulation has its own copy. They count as state.
-        persistent: Keep one ``MjData`` per simulation, which :meth:`contact_forces` needs.
-        current: After every step, update the outputs that follow from positions and velocities. This costs nothing if
-            ``persistent``, because the next step reuses the results.
+    The arguments are those of every :data:`~torchrl_mcp.envs.physics.engines.Engine` but the device. Results do not
+    depend on ``num_threads``. If ``persistent``, ``current`` costs nothing, because the next step reuses the results.
     """
 
     def __init__(

@@ -44,9 +44,9 @@ class WarpSimulation(Simulation):
         num_envs: Number N of simulations.
         device: Device of the simulation.
         substeps: Physics steps per call of :meth:`step`.
-        outputs: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
-        model_fields: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
-        current: See :func:`~torchrl_mcp.envs.physics.engines.make_simulation`.
+        outputs: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
+        model_fields: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
+        current: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         contacts: Allocated contacts, on average over all simulations; None for :func:`contact_room`.
         constraints: Allocated constraints of each simulation; None for :func:`constraint_room` of the contacts.
     """

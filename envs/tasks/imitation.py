@@ -6,7 +6,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative
+from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import joint_layout
 from torchrl_mcp.envs.characters.mirror import Mirror, mirror_bodies
@@ -32,6 +32,12 @@ ERRORS = (
     "com",
 )
 """Errors of a character against its reference, for the terms of the reward."""
+
+SWITCHES = ("any", "same")
+"""Clips to which the reference may jump."""
+
+CLIP_ENDS = ("truncate", "switch")
+"""What the end of a clip may do."""
 
 
 class Imitation(PDCharacterEnv):
@@ -109,15 +115,15 @@ class Imitation(PDCharacterEnv):
         library = clips if isinstance(clips, MotionLibrary) else MotionLibrary(clips)
         if library.character != character:
             raise ValueError(f"clips are of {library.character}: pass motions of character={character!r}")
-        not_negative(max_error=max_error)
+        positive(max_error=max_error)
         if not switch_interval > 0:
             raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
         if switch_candidates < 1:
             raise ValueError(f"switch_candidates={switch_candidates} is out of range: pass at least 1")
-        if switch_to not in ("any", "same"):
-            raise ValueError(f"switch_to={switch_to!r} is unknown: pass 'any' or 'same'")
-        if clip_end not in ("truncate", "switch"):
-            raise ValueError(f"clip_end={clip_end!r} is unknown: pass 'truncate' or 'switch'")
+        if switch_to not in SWITCHES:
+            raise ValueError(f"switch_to={switch_to!r} is unknown: pass {' or '.join(SWITCHES)}")
+        if clip_end not in CLIP_ENDS:
+            raise ValueError(f"clip_end={clip_end!r} is unknown: pass {' or '.join(CLIP_ENDS)}")
         self.max_error, self.clip_end = max_error, clip_end
         self.terms = {name: Term(**term) for name, term in terms.items()}
         self.switch_candidates, self.switch_to = switch_candidates, switch_to

@@ -67,7 +67,7 @@ def rehearse(method, waits):
             checkpoint.find(run).unlink()
             experiment.resume(run)
             found["resumed"] = rows(run)
-        found["evaluation"] = policies.evaluate_run(run, episodes=2, seed=0, max_episode_steps=3)
+        found["evaluation"] = policies.evaluation(run, episodes=2, seed=0, max_episode_steps=3)
     return found
 
 

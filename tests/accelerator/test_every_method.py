@@ -41,7 +41,7 @@ def test_a_method_learns_what_it_learns_on_the_cpu_and_resumes_to_the_same_numbe
         assert found["pretrain"] == [pytest.approx(row, rel=1e-3, abs=1e-6, nan_ok=True) for row in found["cpu"]]
     assert len(found["transfer"]) == 2
     assert str(found["resumed"]) == str(found["transfer"])  # NaN where no episode has ended
-    for numbers in found["evaluation"].values():
+    for numbers in (found["evaluation"][mode] for mode in ("deterministic", "stochastic")):
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
 
 

@@ -1,5 +1,4 @@
 from functools import partial
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -7,6 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.finetune import injected_actor, injected_parts
 from torchrl_mcp.methods.latent_space import latent_actor, latent_parts
 from torchrl_mcp.methods.mcp import composite_actor, composite_parts, weights_actor
@@ -15,12 +15,6 @@ from torchrl_mcp.modules import Gating, GaussianPolicy, GoalEncoder, InjectedPol
 
 GATING = partial(Gating, state_cells=(16, 8), goal_cells=(16, 8), joint_cells=(8,))
 PRIMITIVES = partial(Primitives, trunk_cells=(16, 8), branch_cells=8)
-
-
-class Sizes(NamedTuple):
-    observation: int
-    goal: int
-    action: int
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +29,7 @@ def composite(sizes):
 
     def composite(*, gate_activation, distribution_class, num_primitives=4, gain=1.0, initial_std=0.3):
         return composite_parts(
-            *sizes,
+            sizes,
             gating=partial(GATING, output_gain=gain),
             gate_activation=gate_activation,
             primitives=partial(PRIMITIVES, output_gain=gain),
@@ -57,15 +51,15 @@ def make_actor(sizes, composite):
         heads = {"gate_activation": nn.Sigmoid(), "distribution_class": mixer}
         frozen = ["primitives", "observation_normaliser"] if "frozen" in name or name == "weights" else []
         if name == "gaussian":
-            parts = gaussian_parts(*sizes, policy=partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0))
+            parts = gaussian_parts(sizes, policy=partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0))
             actor = gaussian_actor(parts)
         elif name == "injected":
             policy = partial(InjectedPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
-            parts = injected_parts(*sizes, policy=policy, blind=False)
+            parts = injected_parts(sizes, policy=policy, blind=False)
             actor = injected_actor(parts)
         elif name == "latent":
             decoder = partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
-            parts = latent_parts(*sizes, encoder=partial(GoalEncoder, num_cells=(8,)), decoder=decoder, latent_dim=2)
+            parts = latent_parts(sizes, encoder=partial(GoalEncoder, num_cells=(8,)), decoder=decoder, latent_dim=2)
             actor = latent_actor(parts)
         elif name == "weights":
             parts = composite(**heads)

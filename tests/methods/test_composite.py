@@ -9,6 +9,7 @@ from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.mcp import composite_actor
 
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
@@ -31,7 +32,7 @@ def test_what_a_composite_plays_in_one_state_varies_by_the_standard_deviation_as
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         cfg = compose("train", [f"method={method}", "task=imitation"])
     torch.manual_seed(1)
-    parts = instantiate(cfg.parts)(105, 208, 17)
+    parts = instantiate(cfg.parts)(Sizes(105, 208, 17))
     actor = instantiate(cfg.actor)(parts)
     states = TensorDict(observation=torch.randn(64, 105), goal=torch.randn(64, 208), batch_size=64)
     with torch.no_grad():

@@ -6,6 +6,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from torch import nn
 
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.modules.primitives import BatchedLinear
 
 APPENDIX_E = ("width=1.0", "learned_std=false")  # the default preset has half the width and learned noise
@@ -24,7 +25,7 @@ def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_fo
 ):
     cfg = configure(f"mixer={mixer}", f"gating={activation}", f"num_primitives={num_primitives}")
     torch.manual_seed(0)
-    parts, td = instantiate(cfg.parts)(*sizes), states(200)
+    parts, td = instantiate(cfg.parts)(sizes), states(200)
     parts["observation_normaliser"].update(td["observation"])
     stddev = instantiate(cfg.actor)(parts).trained.get_dist(td).stddev
     # Random last layers spread the deviations of states and actions around it.
@@ -52,8 +53,8 @@ def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_fo
 def test_the_configuration_builds_appendix_e_for_the_biped(method, stage, parameters):
     task, goal_dim = {"pretrain": ("imitation", 208), "transfer": ("heading", 2)}[stage]
     cfg = configure(f"method={method}", f"stage={stage}", f"task={task}", "character=biped", *APPENDIX_E)
-    parts = instantiate(cfg.parts)(105, goal_dim, 17)
-    instantiate(cfg.critic)(parts, 105, goal_dim)
+    parts = instantiate(cfg.parts)(Sizes(105, goal_dim, 17))
+    instantiate(cfg.critic)(parts, Sizes(105, goal_dim, 17))
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert counts == {"observation_normaliser": 0, "goal_normaliser": 0, **parameters}
 
@@ -74,7 +75,7 @@ COUNTS = {
 @pytest.mark.parametrize(("method", "stage"), COUNTS)
 def test_parameters_are_as_many_as_the_paper_s_layers_have(method, stage):
     cfg = configure(f"method={method}", f"stage={stage}", "character=biped", "task=heading", *APPENDIX_E)
-    parts = instantiate(cfg.parts)(105, 2, 17)
+    parts = instantiate(cfg.parts)(Sizes(105, 2, 17))
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert {name: count for name, count in counts.items() if count} == COUNTS[method, stage]
 
@@ -87,8 +88,8 @@ def test_width_scales_every_hidden_layer_of_every_network(method, stage):
     hidden = {}
     for width in (1.0, 0.5):
         cfg = configure(f"method={method}", f"stage={stage}", "task=heading", "character=biped", f"width={width}")
-        parts = instantiate(cfg.parts)(105, 2, 17)
-        instantiate(cfg.critic)(parts, 105, 2)
+        parts = instantiate(cfg.parts)(Sizes(105, 2, 17))
+        instantiate(cfg.critic)(parts, Sizes(105, 2, 17))
         linear = [layer for layer in parts.modules() if isinstance(layer, (nn.Linear, BatchedLinear))]
         hidden[width] = [layer.bias.shape[-1] for layer in linear if layer.bias is not None]
     changed = [(full, half) for full, half in zip(hidden[1.0], hidden[0.5], strict=True) if full != half]
@@ -99,4 +100,4 @@ def test_width_scales_every_hidden_layer_of_every_network(method, stage):
 
 def test_a_width_without_units_is_refused():
     with pytest.raises(ValueError, match="width=0"):
-        instantiate(configure("width=0.0").parts)(105, 2, 17)
+        instantiate(configure("width=0.0").parts)(Sizes(105, 2, 17))

@@ -69,7 +69,7 @@ def test_any_batch_of_states_is_acted_on(name, batch, make_actor, sample, sizes)
 @pytest.mark.parametrize("name", ACTORS)
 def test_the_loss_needs_only_what_the_actor_says_it_stores(name, make_actor, sizes, states):
     actor, parts = make_actor(name)
-    critic = value_critic(parts, sizes.observation, sizes.goal, num_cells=(8,))
+    critic = value_critic(parts, sizes, num_cells=(8,))
     loss = BoundedClipPPOLoss(actor.trained, critic, bound_coeff=1.0, entropy_bonus=False, functional=False)
     loss.set_keys(action=actor.sampled, sample_log_prob=actor.log_prob)
     with torch.no_grad():

@@ -3,6 +3,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.critic import value_critic
 from torchrl_mcp.modules import RunningNormaliser
 
@@ -27,14 +28,14 @@ def normalisers(observation_dim, goal_dim):
 )
 def test_it_has_the_parameters_of_section_e1(observation_dim, goal_dim, parameters):
     parts = normalisers(observation_dim, goal_dim)
-    critic = value_critic(parts, observation_dim, goal_dim)
+    critic = value_critic(parts, Sizes(observation_dim, goal_dim, 17))
     assert sum(parameter.numel() for parameter in critic.parameters()) == parameters
     assert [type(layer) for layer in parts["critic"]] == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
 
 
 def test_it_values_the_normalised_state_and_goal_of_any_batch():
     parts = normalisers(3, 2)
-    critic = value_critic(parts, 3, 2, num_cells=(8, 6))
+    critic = value_critic(parts, Sizes(3, 2, 1), num_cells=(8, 6))
     observation, goal = 4 + 3 * torch.randn(5, 7, 3), torch.randn(5, 7, 2)
     parts["observation_normaliser"].update(observation)
     parts["goal_normaliser"].update(goal)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.finetune import injected_actor, injected_parts
 from torchrl_mcp.modules import InjectedPolicy
 from torchrl_mcp.training.checkpoint import load_parts, run_checkpoint
@@ -17,7 +18,7 @@ POLICY = partial(InjectedPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
 def pretrained(*, blind):
     """Return parts that have seen data and whose weights have all moved that may."""
     torch.manual_seed(0)
-    parts = injected_parts(S, OLD, A, policy=POLICY, blind=blind)
+    parts = injected_parts(Sizes(S, OLD, A), policy=POLICY, blind=blind)
     parts["observation_normaliser"].update(2 + 3 * torch.randn(50, S))
     parts["goal_normaliser"].update(1 + 5 * torch.randn(50, OLD))
     with torch.no_grad():
@@ -30,7 +31,7 @@ def pretrained(*, blind):
 def transferred(parts, tmp_path, goal_dim, keep):
     """Return new parts for another goal, the kept ones by way of a checkpoint file."""
     file = run_checkpoint(parts).save(tmp_path / "checkpoint.torchrl")
-    new = injected_parts(S, goal_dim, A, policy=POLICY, blind=False)
+    new = injected_parts(Sizes(S, goal_dim, A), policy=POLICY, blind=False)
     load_parts(new, keep, file)
     return new
 
@@ -75,7 +76,7 @@ def test_where_the_goal_is_the_same_it_goes_on_to_the_bit_with_its_goal(tmp_path
 
 
 def test_at_transfer_everything_learns_and_the_goal_begins_to_count():
-    parts = injected_parts(S, NEW, A, policy=POLICY, blind=False)
+    parts = injected_parts(Sizes(S, NEW, A), policy=POLICY, blind=False)
     actor = injected_actor(parts)
     optimizer = torch.optim.SGD(actor.trained.parameters(), lr=0.1)
     td = TensorDict(observation=torch.randn(64, S), goal=torch.randn(64, NEW), batch_size=[64])
@@ -87,7 +88,7 @@ def test_at_transfer_everything_learns_and_the_goal_begins_to_count():
 
 
 def test_a_blind_policy_cannot_learn_of_the_goal():
-    parts = injected_parts(S, NEW, A, policy=POLICY, blind=True)
+    parts = injected_parts(Sizes(S, NEW, A), policy=POLICY, blind=True)
     td = TensorDict(observation=torch.randn(64, S), goal=torch.randn(64, NEW), batch_size=[64])
     injected_actor(parts).trained.get_dist(td).mean.square().sum().backward()
     assert parts["goal_input"].weight.grad is None

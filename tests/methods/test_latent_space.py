@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torch.distributions import Independent, Normal
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.latent_space import LATENT, NOISE, latent_actor, latent_parts
 from torchrl_mcp.modules import GaussianPolicy, GoalEncoder, StateGoalEncoder
 
@@ -15,9 +16,7 @@ S, G, A, L = 6, 2, 3, 4
 def make(encoder=StateGoalEncoder, frozen=()):
     torch.manual_seed(0)
     parts = latent_parts(
-        S,
-        G,
-        A,
+        Sizes(S, G, A),
         encoder=partial(encoder, num_cells=(16, 8)),
         decoder=partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0),
         latent_dim=L,
@@ -108,4 +107,4 @@ def test_a_frozen_decoder_passes_gradients_on_to_the_encoder():
 
 def test_a_latent_space_without_dimensions_is_refused():
     with pytest.raises(ValueError, match="latent_dim must be at least 1, got 0"):
-        latent_parts(S, G, A, encoder=GoalEncoder, decoder=GaussianPolicy, latent_dim=0)
+        latent_parts(Sizes(S, G, A), encoder=GoalEncoder, decoder=GaussianPolicy, latent_dim=0)

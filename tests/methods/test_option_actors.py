@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.hierarchical import gated_actor, gated_parts, primitive_actor, primitive_parts
 from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts
 from torchrl_mcp.methods.options import SeparateOptions, Terminations
@@ -22,7 +23,9 @@ def hierarchical(steps_per_choice=3):
     """Return parts and actor of the hierarchical model at transfer."""
     torch.manual_seed(0)
     gating = partial(JointGating, num_cells=(16, 8))
-    parts = gated_parts(S, G, A, gating=gating, primitives=partial(SeparateOptions, policy=POLICY), num_options=K)
+    parts = gated_parts(
+        Sizes(S, G, A), gating=gating, primitives=partial(SeparateOptions, policy=POLICY), num_options=K
+    )
     return parts, gated_actor(parts, num_options=K, steps_per_choice=steps_per_choice, frozen=FROZEN)
 
 
@@ -30,9 +33,7 @@ def option_critic(initial=0.5, epsilon=0.1, frozen=()):
     """Return parts and actor of the option-critic."""
     torch.manual_seed(0)
     parts = option_critic_parts(
-        S,
-        G,
-        A,
+        Sizes(S, G, A),
         options=partial(Primitives, trunk_cells=(16, 8), branch_cells=0, initial_std=0.3),
         terminations=partial(Terminations, num_cells=(16, 8), initial=initial),
         values_cells=(16, 8),
@@ -44,7 +45,7 @@ def option_critic(initial=0.5, epsilon=0.1, frozen=()):
 def pretraining():
     """Return parts and actor of the hierarchical model while its primitives are trained."""
     torch.manual_seed(0)
-    parts = primitive_parts(S, G, A, primitives=partial(SeparateOptions, policy=POLICY), num_options=K)
+    parts = primitive_parts(Sizes(S, G, A), primitives=partial(SeparateOptions, policy=POLICY), num_options=K)
     return parts, primitive_actor(parts, num_options=K)
 
 

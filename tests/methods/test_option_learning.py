@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_explorati
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.critic import value_critic
 from torchrl_mcp.methods.hierarchical import gated_actor, gated_parts
 from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts, option_values
@@ -66,15 +67,13 @@ def test_the_option_critic_learns_options_that_beat_chance():
     torch.manual_seed(3)
     env = TransformedEnv(FourCorners(256), OptionMemory())
     parts = option_critic_parts(
-        2,
-        4,
-        2,
+        Sizes(2, 4, 2),
         options=partial(Primitives, trunk_cells=(32,), branch_cells=0, initial_std=0.5),
         terminations=partial(Terminations, num_cells=(32,), initial=0.02),
         values_cells=(32,),
         num_options=4,
     )
-    actor, critic = option_critic_actor(parts, num_options=4, epsilon=0.1), option_values(parts, 2, 4)
+    actor, critic = option_critic_actor(parts, num_options=4, epsilon=0.1), option_values(parts, Sizes(2, 4, 2))
     advantages = OptionAdvantages(critic, gamma=0.95, lmbda=0.95, clip=4.0, epsilon=0.1, termination_cost=0.01)
     loss = OptionCriticLoss(actor.trained, critic, clip_epsilon=0.2, bound_coeff=0.0)
     optimizer = torch.optim.Adam(
@@ -105,9 +104,7 @@ def test_the_gate_learns_to_sequence_primitives_that_it_is_given():
     env = TransformedEnv(FourCorners(256), OptionMemory())
     policy = partial(GaussianPolicy, num_cells=(8,), std=0.3, output_gain=0.0)
     parts = gated_parts(
-        2,
-        4,
-        2,
+        Sizes(2, 4, 2),
         gating=partial(JointGating, num_cells=(32,)),
         primitives=partial(SeparateOptions, policy=policy),
         num_options=4,
@@ -115,7 +112,7 @@ def test_the_gate_learns_to_sequence_primitives_that_it_is_given():
     for policy, corner in zip(parts["primitives"].policies, FourCorners.corners, strict=True):
         policy.output.bias.data.copy_(corner)
     actor = gated_actor(parts, num_options=4, steps_per_choice=5, frozen=["primitives", "observation_normaliser"])
-    critic = value_critic(parts, 2, 4, num_cells=(32,))
+    critic = value_critic(parts, Sizes(2, 4, 2), num_cells=(32,))
     advantages = SemiMarkovAdvantages(critic, gamma=0.95, lmbda=0.95, clip=4.0)
     loss = ClipPPOLoss(actor.trained, critic, entropy_bonus=False, loss_critic_type="l2", functional=False)
     loss.set_keys(action=actor.sampled, sample_log_prob=actor.log_prob)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.critic import value_critic
 from torchrl_mcp.methods.latent_space import NOISE, latent_actor, latent_parts
 from torchrl_mcp.modules import GaussianPolicy, StateGoalEncoder
@@ -15,14 +16,12 @@ S, G, A, L = 6, 2, 3, 4
 def make(loss_class, **kwargs):
     torch.manual_seed(0)
     parts = latent_parts(
-        S,
-        G,
-        A,
+        Sizes(S, G, A),
         encoder=partial(StateGoalEncoder, num_cells=(16, 8)),
         decoder=partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0),
         latent_dim=L,
     )
-    actor, critic = latent_actor(parts), value_critic(parts, S, G, num_cells=(8,))
+    actor, critic = latent_actor(parts), value_critic(parts, Sizes(S, G, A), num_cells=(8,))
     loss = loss_class(actor.trained, critic, bound_coeff=1.0, entropy_bonus=False, loss_critic_type="l2", **kwargs)
     with torch.no_grad():
         samples = actor.policy(TensorDict(observation=torch.randn(32, S), goal=torch.randn(32, G), batch_size=[32]))

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import benchmark, experiment, policies
+from torchrl_mcp.runs import benchmark, policies, records
 
 BENCHMARKS = Path(conf.__file__).parent / "benchmark"
 CHARACTERS = {"ant", "biped", "humanoid", "trex"}
@@ -288,7 +289,7 @@ def test_a_benchmark_of_your_own_code_reads_its_runs_without_being_told_to_trust
         smoke(tmp_path / "runs", "method=scratch", "parts._target_=own_parts.parts")
         assert "the run is complete" in capsys.readouterr().out
     with pytest.raises(ValueError, match="pass --trust own_parts"):
-        experiment.run_config(next(tmp_path.rglob("config.yaml")).parent)
+        records.run_config(next(tmp_path.rglob("config.yaml")).parent)
 
 
 def needs_plugin(name):
@@ -320,6 +321,13 @@ def test_the_slurm_launcher_composes_and_queues_again_what_reached_its_time_limi
     assert launcher["_target_"].endswith("SlurmLauncher")
     assert launcher.partition == "long"
     assert launcher.max_num_timeout > 0
+
+
+def test_a_plan_refers_to_hydra_for_the_names_of_folders_and_leaves_it_as_it_was():
+    former = HydraConfig.instance().cfg
+    (*_, job) = jobs_of("benchmark=smoke", "method=scratch", "lmbda=0.5")
+    assert "lmbda-0.5" in str(job.folder)
+    assert HydraConfig.instance().cfg is former
 
 
 def test_rows_with_numbers_are_selected_by_the_command_line():

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build, builtin, experiment, policies, publish
+from torchrl_mcp.runs import build, builtin, experiment, policies, publish, records
 from torchrl_mcp.training import checkpoint
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -86,7 +86,7 @@ def test_loaded_networks_keep_their_width_and_new_ones_have_the_runs(run, publis
     hidden = {name: first_layer(agent.parts[name]) for name in ("primitives", "gating")}
     assert hidden == {"primitives": first_layer(original.parts["primitives"]), "gating": 64}  # an eighth of 512
     longer = configure(tmp_path / "longer", *BIPED, "width=0.125", "training.total_frames=128", f"pretrained={run}")
-    assert experiment.run_config(experiment.train(longer)).width == 0.0625
+    assert records.run_config(experiment.train(longer)).width == 0.0625
 
 
 def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
@@ -132,6 +132,6 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
     ids=lambda path: path.stem,
 )
 def test_what_comes_with_the_library_follows_its_motions(path):
-    results = policies.evaluate_run(path, episodes=8, seed=0, max_episode_steps=30)
+    results = policies.evaluation(path, episodes=8, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25
     assert results["deterministic"]["metrics"]["tracking_error"] < 0.15

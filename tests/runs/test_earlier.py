@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import OmegaConf
 
-from torchrl_mcp.runs import experiment, policies
+from torchrl_mcp.runs import configuration, experiment, policies
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import require_resumable, translated
 from torchrl_mcp.training import checkpoint
@@ -11,7 +11,9 @@ from torchrl_mcp.training import checkpoint
 
 def test_what_this_version_lacks_is_left_out_at_any_depth():
     held = {"task": {"pretrain": {"failure_weighting": 0.5, "max_error": 0.3}}, "list": [{"shaping": {}}], "seed": 1}
-    assert translated(held) == {"task": {"pretrain": {"max_error": 0.3}}, "list": [{}], "seed": 1}
+    made = translated(held)
+    del made["physics"]
+    assert made == {"task": {"pretrain": {"max_error": 0.3}}, "list": [{}], "seed": 1}
 
 
 def test_a_published_network_that_was_trained_with_what_is_removed_can_be_restored():
@@ -20,6 +22,14 @@ def test_a_published_network_that_was_trained_with_what_is_removed_can_be_restor
     cfg, agent, env = policies.restore(file, num_envs=2, seed=0)
     assert "failure_weighting" not in cfg.task.pretrain
     assert agent.actor.policy(env.reset())["action"].shape == (2, env.action_spec.shape[-1])
+
+
+@pytest.mark.parametrize("held", [{}, {"physics": "mujoco"}, {"physics": "warp"}])
+def test_an_engine_that_was_a_name_is_a_group_of_settings_in_this_version(held):
+    engine = held.get("physics", "mujoco")
+    cfg = configuration.compose_run("task=heading", "run_dir=never", f"physics={engine}")
+    assert translated(held) == {"physics": OmegaConf.to_container(cfg.physics)}
+    assert translated(translated(held)) == translated(held)
 
 
 def test_settings_of_training_episodes_are_one_setting_in_this_version():

@@ -6,7 +6,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp.evaluation.rollout import evaluate
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, requirements
 
 STAGES = {
     "holdout": "pretrain",
@@ -111,7 +111,7 @@ def trained_otherwise(task):
 @every_task
 def test_an_evaluation_says_every_setting_of_its_environment(task):
     cfg = configure(task)
-    arguments = build.arguments(cfg.task[STAGES[task]]._target_)
+    arguments = requirements.arguments(cfg.task[STAGES[task]]._target_)
     inside = {
         "furnish",
         "episode",

@@ -15,7 +15,7 @@ from torch import nn
 
 from torchrl_mcp import conf
 from torchrl_mcp.cli import evaluate, train
-from torchrl_mcp.runs import benchmark, build, experiment, policies
+from torchrl_mcp.runs import benchmark, build, experiment, policies, records
 from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -125,7 +125,7 @@ def test_a_run_of_a_gpu_goes_on_without_one_if_told_to(run, tmp_path):
         experiment.resume(copy)
     assert contents(copy) == before
     experiment.resume(copy, device="cpu")
-    assert experiment.is_complete(copy)
+    assert records.is_complete(copy)
 
 
 def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
@@ -178,13 +178,13 @@ def evaluated(run, tmp_path_factory):
     cfg = OmegaConf.load(copy / "config.yaml")
     cfg.evaluation.episodes = 3
     OmegaConf.save(cfg, copy / "config.yaml")
-    assert not experiment.is_complete(copy)
+    assert not records.is_complete(copy)
     experiment.resume(copy)
     return copy
 
 
 def test_training_ends_with_an_evaluation_also_after_a_resume(evaluated):
-    assert experiment.is_complete(evaluated)
+    assert records.is_complete(evaluated)
     written = json.loads((evaluated / "evaluation.json").read_text())
     assert (written["episodes"], written["seed"]) == (3, 12345)
     assert written["environment"]["max_episode_steps"] == 200  # of the task, where training had 100
@@ -207,9 +207,9 @@ def test_a_run_that_is_to_go_on_loses_its_evaluation_and_gets_another(evaluated,
     cfg = OmegaConf.load(copy / "config.yaml")
     cfg.training.total_frames *= 2
     OmegaConf.save(cfg, copy / "config.yaml")
-    assert not experiment.is_complete(copy)
+    assert not records.is_complete(copy)
     experiment.resume(copy)
-    assert experiment.is_complete(copy)
+    assert records.is_complete(copy)
     assert (copy / "evaluation.json").read_text() != (evaluated / "evaluation.json").read_text()
 
 
@@ -230,7 +230,7 @@ def test_a_run_of_another_version_is_refused_with_the_name_it_misses_and_the_rem
     before = contents(folder)
     readers = [
         (folder / "config.yaml", lambda: experiment.resume(folder)),
-        (folder / "config.yaml", lambda: experiment.is_complete(folder)),
+        (folder / "config.yaml", lambda: records.is_complete(folder)),
         (file, lambda: policies.restore(file, num_envs=1, seed=0)),
         (file, lambda: policies.evaluation(file, episodes=1, seed=0)),
     ]

@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchrl_mcp.runs import experiment, lock, policies
+from torchrl_mcp.runs import build, experiment, lock, policies
 from torchrl_mcp.runs.status import status
 from torchrl_mcp.training import checkpoint, run_folder
 
@@ -78,7 +78,7 @@ def test_a_run_holds_its_folder_from_before_the_first_file_to_after_the_last(tmp
         return wrapper
 
     states = []
-    monkeypatch.setattr(experiment, "_trainer", seen(experiment._trainer))
+    monkeypatch.setattr(build, "make_run", seen(build.make_run))
     monkeypatch.setattr(experiment, "evaluation", seen(lambda *arguments, **settings: {"deterministic": {}}))
     experiment.train(configure(tmp_path / "run", "evaluation.episodes=1"))
     assert states == ["running", "running"]

@@ -12,10 +12,6 @@ TRAIN = yaml.safe_load((Path(conf.__file__).parent / "train.yaml").read_text())
 GROUPS = {name for group in TRAIN["defaults"] if isinstance(group, dict) for name in group}
 
 
-def test_hydra_leaves_the_same_settings_out_of_the_names_of_run_folders():
-    assert set(TRAIN["hydra"]["job"]["config"]["override_dirname"]["exclude_keys"]) == UNNAMED
-
-
 def test_every_level_of_a_run_folder_is_in_its_path():
     for setting in LEVELS:
         assert f"${{{setting}" in TRAIN["run_dir"].replace(".name", "")

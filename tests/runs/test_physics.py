@@ -6,11 +6,12 @@ import math
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from hydra.errors import MissingConfigException
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.physics import engines
 from torchrl_mcp.evaluation.rollout import evaluate
-from torchrl_mcp.runs import build, experiment, policies
+from torchrl_mcp.runs import configuration, experiment, policies, requirements
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.training import checkpoint
 
@@ -36,17 +37,19 @@ def rows(folder):
         return [{k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in lines]
 
 
-def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(monkeypatch):
+def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "find_spec", lambda name: None)
+    run = tmp_path / "run"
     with pytest.raises(ValueError, match=r"pip install 'torchrl-mcp\[warp\]', or choose physics=mujoco"):
-        build.require_equipment(composed("physics=warp"))
+        experiment.train(composed("physics=warp", "autocast=false", f"run_dir={run}"))
+    assert not run.exists()
     with pytest.raises(ValueError, match="physics=warp needs MuJoCo Warp"):
         Heading("biped", 2, physics="warp")
 
 
 def test_an_engine_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match="physics=bullet must be mujoco or warp"):
-        build.require_valid(composed("physics=bullet"))
+    with pytest.raises(MissingConfigException, match="Could not find 'physics/bullet'"):
+        composed("physics=bullet")
     with pytest.raises(ValueError, match="physics='bullet' is unknown: pass mujoco or warp"):
         Heading("biped", 2, physics="bullet")
 
@@ -56,10 +59,9 @@ def test_mujocos_threads_simulate_on_the_cpu_alone():
         Heading("biped", 2, device="meta")
 
 
-def test_workers_do_not_simulate_on_a_device(monkeypatch):
-    monkeypatch.setattr(engines, "find_spec", lambda name: object())
+def test_workers_do_not_simulate_on_a_device():
     with pytest.raises(ValueError, match=r"all environments at once.*pass collector=local"):
-        build.require_equipment(composed("physics=warp", "collector=processes"))
+        requirements.require_equipment(composed("physics=warp", "collector=processes"))
 
 
 @pytest.mark.parametrize(
@@ -114,7 +116,8 @@ def test_a_pre_training_learns_as_on_mujocos_threads(tmp_path, monkeypatch):
     ]
     learned = {}
     for physics in engines.ENGINES:
-        run = experiment.train(build.compose_run(*settings, f"physics={physics}", f"run_dir={tmp_path / physics}"))
+        cfg = configuration.compose_run(*settings, f"physics={physics}", f"run_dir={tmp_path / physics}")
+        run = experiment.train(cfg)
         returns = [float(row["episode/normalised_return"]) for row in rows(run)]
         first, last = sum(returns[:3]) / 3, sum(returns[-10:]) / 10
         assert last > 1.5 * first

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from torchrl_mcp.envs.motions.trex import trex_corpus
 from torchrl_mcp.runs import identity, places, quoting
@@ -152,5 +153,6 @@ def test_a_stored_configuration_has_no_place_but_absolute_ones(begun):
 def test_the_path_of_a_class_is_no_place():
     config = {"made": {"_target_": "hydra.utils.get_class", "path": "torch.nn.Linear"}, "pretrained": "builtin"}
     assert places.outside(config) == {}
-    assert places.stored(config) == config
-    assert places.stored({"motions": {"path": "clips"}})["motions"]["path"] == str(Path("clips").absolute())
+    assert places.stored(OmegaConf.create(config)) == {**config, "run_dir": ".", "run_root": "."}
+    relative = OmegaConf.create({"motions": {"path": "clips"}})
+    assert places.stored(relative)["motions"]["path"] == str(Path("clips").absolute())

@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 
 from torchrl_mcp import __version__
-from torchrl_mcp.runs import build, provenance
+from torchrl_mcp.runs import provenance
 from torchrl_mcp.training.precision import Precision
 
 
@@ -50,10 +50,9 @@ def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tm
 
 def test_provenance_names_command_code_time_and_machine(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["script.py", "seed=3"])
-    monkeypatch.setattr(build.HydraConfig, "initialized", lambda: False)
-    command, choices = build.launched()
+    monkeypatch.setattr(provenance.HydraConfig, "initialized", lambda: False)
     precision, inputs = Precision(True, "as measured"), {"pretrained": "1234abcd"}
-    where_from = provenance.provenance("cpu", command, choices, precision, inputs)
+    where_from = provenance.provenance("cpu", precision, inputs)
     content = json.loads(json.dumps(where_from))
     assert content["command"] == ["script.py", "seed=3"]
     assert content["precision"] == "networks in bfloat16: as measured"
@@ -73,6 +72,6 @@ def test_within_hydra_command_and_choices_are_those_of_the_job(monkeypatch):
             "runtime": {"choices": {"preset": "fast", "hydra/launcher": "basic", "benchmark": None}},
         }
     )
-    monkeypatch.setattr(build.HydraConfig, "initialized", lambda: True)
-    monkeypatch.setattr(build.HydraConfig, "get", lambda: hydra)
-    assert build.launched() == (["torchrl-mcp-train", "preset=fast", "seed=1"], {"preset": "fast"})
+    monkeypatch.setattr(provenance.HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(provenance.HydraConfig, "get", lambda: hydra)
+    assert provenance.launched() == (["torchrl-mcp-train", "preset=fast", "seed=1"], {"preset": "fast"})

@@ -1,12 +1,12 @@
 """What this machine or the command line lacks is said before a folder exists."""
 
-import importlib.util
+from importlib.util import find_spec
 
 import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import experiment, requirements
 
 HEADING = ["task=heading", "character=humanoid"]
 
@@ -18,7 +18,7 @@ def configure(folder, *overrides):
 
 @pytest.mark.parametrize("kind", ["wandb", "mlflow"])
 def test_a_logger_that_is_not_installed_is_named_with_what_installs_it(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(build, "find_spec", lambda name: None if name == kind else importlib.util.find_spec(name))
+    monkeypatch.setattr(requirements, "find_spec", lambda name: None if name == kind else find_spec(name))
     with pytest.raises(ValueError, match=rf"logger={kind} needs {kind}: pip install 'torchrl-mcp\[{kind}\]'"):
         experiment.train(configure(tmp_path, f"logger={kind}"))
     assert list(tmp_path.iterdir()) == []

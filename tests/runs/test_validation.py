@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import configuration, experiment
 from torchrl_mcp.runs.validation import RULES
 
 METHODS = sorted(path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml"))
@@ -29,13 +29,13 @@ def place(method, task):
 
 @pytest.mark.parametrize(("method", "task"), PLACES)
 def test_what_the_library_configures_is_valid(method, task):
-    build.require_valid(composed(*place(method, task)))
+    configuration.require_valid(composed(*place(method, task)))
 
 
 @pytest.mark.parametrize("preset", ["paper", "smoke", "demo", "demo_smoke", "comparison"])
 def test_every_preset_is_valid(preset):
     for method, task in (("mcp", "holdout"), ("hierarchical", "heading")):
-        build.require_valid(composed(*place(method, task), f"preset={preset}"))
+        configuration.require_valid(composed(*place(method, task), f"preset={preset}"))
 
 
 def test_settings_of_a_method_hold_in_the_stage_that_they_name():
@@ -98,7 +98,7 @@ def test_a_value_that_a_setting_cannot_have_is_named(setting, value):
     OmegaConf.set_struct(cfg, False)
     OmegaConf.update(cfg, setting, OmegaConf.create(f"value: {value}").value, merge=False)
     with pytest.raises(ValueError, match=setting.partition(".")[0]):
-        build.require_valid(cfg)
+        configuration.require_valid(cfg)
 
 
 def test_all_wrong_values_are_named_at_once_and_no_folder_is_made(tmp_path):
@@ -115,16 +115,16 @@ def test_all_wrong_values_are_named_at_once_and_no_folder_is_made(tmp_path):
 
 def test_a_missing_value_is_asked_for():
     with pytest.raises(ValueError, match=r"motions\.path is needed: pass motions\.path="):
-        build.require_valid(composed("task=imitation", "motions=folder"))
+        configuration.require_valid(composed("task=imitation", "motions=folder"))
 
 
 def test_no_setting_takes_a_run_out_of_the_folder_of_runs():
     cfg = composed().copy()
     cfg.run_dir = "runs/imitation-biped/pretrain/mcp/motions.path-../../../../../../elsewhere/seed0"
     with pytest.raises(ValueError, match=r"leaves run_root=runs: pass a run_dir"):
-        build.require_valid(cfg)
+        configuration.require_valid(cfg)
     cfg.run_dir = "../elsewhere"
-    build.require_valid(cfg)
+    configuration.require_valid(cfg)
 
 
 WITHOUT_RULE = {

@@ -123,7 +123,7 @@ def test_where_a_tensor_finds_no_room_the_system_s_error_names_the_checkpoint_an
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-        with pytest.raises(OSError, match=r"cannot write .*checkpoint-000000000200.torchrl: File too large"):
+        with pytest.raises(OSError, match=r"cannot write .*checkpoint-000000000200.torchrl: .*File too large"):
             save(run_checkpoint(parts), checkpoints, step=200, config=config)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -180,7 +180,8 @@ def test_only_another_version_of_torch_is_warned_of_and_not_another_build(saved_
         load_parts(make_parts(1), ["gating"], path)
     finally:
         torchrl_logger.removeHandler(handler)
-    assert any("version skew" in message for message in messages) == warned
+    assert all("another version of torch" in message for message in messages)
+    assert len(messages) == warned
 
 
 def test_random_states_of_a_run_on_gpus_are_restored_without_them():

@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_module
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_mcp.envs import Holdout
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import build, experiment, records
 from torchrl_mcp.training import checkpoint, collectors
 from torchrl_mcp.training.collectors import Batches, LocalSource, RemoteSource
 from torchrl_mcp.training.metrics import MetricsWriter
@@ -61,7 +61,7 @@ def living(session):
 
 def restored(folder):
     """The trainer of a run, at its newest checkpoint."""
-    cfg = experiment.run_config(folder)
+    cfg = records.run_config(folder)
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, folder)
     trainer.restore(checkpoint.find(folder))

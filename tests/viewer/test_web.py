@@ -171,6 +171,12 @@ def test_who_may_what(path, host, origin, address, refused):
     assert reason is None if refused is None else refused in reason
 
 
+def test_no_page_is_opened_by_a_version_of_mujoco_that_nobody_has_tried(monkeypatch):
+    monkeypatch.setattr(mujoco, "__version__", "3.18.0")
+    with pytest.raises(RuntimeError, match=r"MuJoCo 3\.18\.0 is not known: install mujoco 3\.17"):
+        play_in_browser(Brief(), port=0)
+
+
 def test_the_log_has_warnings_alone_while_the_viewer_is_open():
     with guarded(HERE):
         assert not web_server.logger.isEnabledFor(logging.INFO)

@@ -47,22 +47,22 @@ def parser() -> argparse.ArgumentParser:
     shared.add_argument(
         "checkpoints", nargs="+", metavar="CHECKPOINT", help="run folder, checkpoint file or builtin:CHARACTER"
     )
-    shared.add_argument("--output", type=Path, default=Path("figures"), help="folder (default figures)")
+    shared.add_argument("--output", type=Path, default=Path("figures"), help="folder (default %(default)s)")
     add_trust(shared)
-    shared.add_argument("--seed", type=int, default=0, help="seed of environments and random numbers (default 0)")
+    shared.add_argument("--seed", type=int, default=0, help="seed of random numbers (default %(default)s)")
 
     command = commands.add_parser("curves", parents=[shared], help="learning curves of run folders in one figure")
     command.set_defaults(draw="curves")
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")
     command.set_defaults(draw="holdout")
     command = commands.add_parser("exploration", parents=[shared], help="Figure 6: paths of random exploration")
-    command.add_argument("--trajectories", type=int, default=48, metavar="N", help="number per method (default 48)")
-    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of each (default 10)")
+    command.add_argument("--trajectories", type=int, default=48, metavar="N", help="how many (default %(default)s)")
+    command.add_argument("--seconds", type=float, default=10.0, help="length of each (default %(default)s)")
     command.set_defaults(draw="explore")
     command = commands.add_parser("primitives", parents=[shared], help="Figure 7: weights over the walk cycle, actions")
     command.add_argument("--clip", help="generated motion to follow, such as left_sharp (default straight ahead)")
-    command.add_argument("--walkers", type=int, default=8, metavar="N", help="number of simulations (default 8)")
-    command.add_argument("--seconds", type=float, default=10.0, help="length of each walk (default 10)")
+    command.add_argument("--walkers", type=int, default=8, metavar="N", help="how many (default %(default)s)")
+    command.add_argument("--seconds", type=float, default=10.0, help="length of each walk (default %(default)s)")
     command.set_defaults(draw="analyse")
     return parser
 

@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     target.add_argument(
         "--module", type=own_module, metavar="MODULE", help="Python module that adds the character to the library's"
     )
-    target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default 30)")
+    target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default %(default)s)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
     source.add_argument("--fps", type=float, help="frames per second of the files, in place of their own (.amc: 120)")
     source.add_argument("--scale", type=float, help="metres per unit of length (default: fits the length of the legs)")
@@ -96,12 +96,12 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--strides", action="store_true", help="add length, cadence, width and more of human strides")
     command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
-    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of the film (default 10)")
+    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of the film (default %(default)s)")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="render_files")
     command = commands.add_parser("build-paper-corpus", parents=[target], help="230 s of walking, from your downloads")
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the downloaded files")
-    command.add_argument("--output", type=Path, default=Path("corpus"), help="folder for the clips (default corpus)")
+    command.add_argument("--output", type=Path, default=Path("corpus"), help="folder (default %(default)s)")
     command.set_defaults(run="build_paper_corpus")
     return parser
 

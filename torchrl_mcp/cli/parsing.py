@@ -95,14 +95,20 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"arguments of the tasks (--task):\n{listed}\n\n{parser.epilog or ''}"
 
 
+def settings(name: str) -> dict[str, Any]:
+    """Return the content of a file of ``conf``, ``train`` or ``task/heading``, as it is written."""
+    return yaml.safe_load(files("torchrl_mcp.conf").joinpath(f"{name}.yaml").read_text(encoding="utf-8"))
+
+
+def choices(group: str) -> list[str]:
+    """Return the choices of a group of settings."""
+    names = (file.name for file in files("torchrl_mcp.conf").joinpath(group).iterdir())
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml") and name != "base.yaml")
+
+
 def _task_arguments() -> Iterator[tuple[str, list[str]]]:
     """Yield each task with its arguments, from its evaluation in ``conf/task``."""
-    conf = files("torchrl_mcp.conf")
-
-    def settings(name: str) -> dict[str, Any]:
-        return yaml.safe_load(conf.joinpath(f"{name}.yaml").read_text(encoding="utf-8"))
-
-    for name in sorted(file.name.removesuffix(".yaml") for file in conf.joinpath("task").iterdir()):
+    for name in choices("task"):
         content = settings(f"task/{name}")
         shared = [entry[1:].partition("@")[0] for entry in content["defaults"] if str(entry).startswith("/")]
         parts = [content.get("task", content), *map(settings, shared)]

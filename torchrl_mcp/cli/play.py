@@ -73,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: folder of your own settings"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of environment and sampling (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of environment and sampling (default %(default)s)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions (default: deterministic)")
     add_task(parser)
     parser.add_argument(
@@ -81,13 +81,13 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=1.0,
         metavar="D",
-        help="distance of the ghost from the character, in extents of the character; 0 for its true place (default 1)",
+        help="distance of the ghost in extents of the character; 0 for its true place (default %(default)s)",
     )
     film = parser.add_argument_group("film")
-    film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default film.gif)")
-    film.add_argument("--seconds", type=float, default=10.0, help="length of the film (default 10)")
-    film.add_argument("--width", type=int, default=480, help="width in pixels (default 480)")
-    film.add_argument("--height", type=int, default=360, help="height in pixels (default 360)")
+    film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default %(default)s)")
+    film.add_argument("--seconds", type=float, default=10.0, help="length of the film (default %(default)s)")
+    film.add_argument("--width", type=int, default=480, help="width in pixels (default %(default)s)")
+    film.add_argument("--height", type=int, default=360, help="height in pixels (default %(default)s)")
     viewer = parser.add_argument_group("viewer")
     viewer.add_argument(
         "--viewer",
@@ -99,7 +99,7 @@ def parser() -> argparse.ArgumentParser:
     viewer.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address that the page is served at (default 127.0.0.1, for this machine alone). With another, such as "
+        help="address that the page is served at (default %(default)s, for this machine alone). With another, such as "
         "0.0.0.0, everybody who can reach the port sees the simulation, its model and the viewer's log with paths of "
         "files, without a password; control and uploads stay with this machine",
     )

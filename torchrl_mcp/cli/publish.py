@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser, settings
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-publish"
@@ -46,7 +46,8 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, required=True, metavar="FILE", help="the file, .torchrl; the card ends in .md"
     )
     parser.add_argument("--limits", action="append", default=[], help="a sentence of the card's limits; repeatable")
-    parser.add_argument("--episodes", type=int, default=128, help="episodes of the card's evaluation (default 128)")
+    episodes = settings("train")["evaluation"]["episodes"]
+    parser.add_argument("--episodes", type=int, default=episodes, help="of the card's evaluation (default %(default)s)")
     return parser
 
 

@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(PROGRAM, "Write the results of many runs beside the paper's, as a web page and as Markdown.")
     parser.add_argument("runs", type=Path, nargs="+", help="run folders, or folders with run folders at any depth")
-    parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write to (default report)")
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write to (default %(default)s)")
     return parser
 
 

@@ -2,29 +2,39 @@
 
 import argparse
 import sys
-from importlib.resources import files
 
-from torchrl_mcp.cli.parsing import add_trust, find_own_modules, interruptible, new_parser, take_trust
+from torchrl_mcp.cli.parsing import add_trust, choices, find_own_modules, interruptible, new_parser, take_trust
 from torchrl_mcp.training.workers import end_with_parent_while_starting, termination_as_interrupt
 
 end_with_parent_while_starting()  # before the imports that take a worker seconds
 
 PROGRAM = "torchrl-mcp-train"
 
-GROUPS = (
-    *("method", "task", "character", "stage", "motions", "imitation", "curriculum", "preset", "benchmark"),
-    *("mixer", "gating", "primitives", "exploration", "optimizer", "collector", "logger"),
-)
-"""Groups of settings for the command line; the choices of other groups come with a method."""
+GROUPS = {
+    **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
+    "task": "imitation to pre-train, holdout in both stages, the others to transfer",
+    "character": "ant for holdout, any other for the other tasks",
+    "stage": "transfer needs pretrained=, for every method but scratch",
+    "preset": "fast learns best here, paper has Tables 5 to 11, comparison the same steps for every method",
+    "benchmark": "many runs of several methods",
+    "exploration": "action samples the composite action, weights the gate; MCP takes weights at transfer",
+    "curriculum": "training episodes: none for those of the evaluation, mixed for easier ones",
+    "motions": "references of imitation",
+    "imitation": "reward of imitation",
+    "physics": "engine of training episodes; warp computes on the GPU, with device=cuda and torchrl-mcp[warp]",
+    **dict.fromkeys(("collector", "optimizer"), ""),
+    "logger": "beside metrics.csv",
+}
+"""Groups of settings for the command line and what they say; the choices of other groups come with a method."""
 
 SETTINGS = {
     "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
-    "seed=N": "seed of networks, environments and sampling (default 0)",
+    "seed=N": "seed of networks, environments and sampling",
     "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
     "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to make it longer",
     "training.total_frames=N": "environment steps",
+    "width=FACTOR": "on the paper's hidden layers",
     "device=cuda": "networks on a GPU; physics stays on the CPU",
-    "physics=warp": "with device=cuda, physics on the GPU as well, by the extra torchrl-mcp[warp]",
 }
 
 EXAMPLES = f"""\
@@ -96,12 +106,6 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def choices(group: str) -> list[str]:
-    """Return the choices of a group of settings."""
-    names = (file.name for file in files("torchrl_mcp.conf").joinpath(group).iterdir())
-    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml") and name != "base.yaml")
-
-
 SWEEPS = """\
 sweeps:
   --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. Repeated, it skips complete runs,
@@ -112,7 +116,9 @@ sweeps:
 
 
 def _epilog() -> str:
-    groups = [f"  {group:13}{', '.join(choices(group))}" for group in GROUPS]
+    groups: list[str] = []
+    for group, meaning in GROUPS.items():
+        groups += [f"  {group:13}{', '.join(choices(group))}", *([f"{'':15}{meaning}"] if meaning else [])]
     settings = [f"  {setting:25}{meaning}" for setting, meaning in SETTINGS.items()]
     return "\n".join(["choices:", *groups, "", "settings:", *settings, "", SWEEPS, "", EXAMPLES])
 

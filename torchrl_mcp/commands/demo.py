@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.commands.demo_page import write_page
-from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs import configuration, experiment, records
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
@@ -95,7 +95,7 @@ def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: 
     """
     presets = dict.fromkeys(RUNS, f"preset={preset}") | {"pretrain": f"preset={preset}_pretrain"}
     runs = {
-        name: build.compose_run(*words, presets[name], *overrides)
+        name: configuration.compose_run(*words, presets[name], *overrides)
         for name, words in RUNS.items()
         if pretrain or name != "pretrain"
     }
@@ -116,8 +116,8 @@ def _require_same(cfg: DictConfig, folder: Path) -> None:
     """
     if not (folder / CONFIG).exists():
         return
-    cfg.autocast = experiment.run_config(folder).autocast
-    if changed := experiment.changes(folder, build.stored(experiment.settled(cfg))):
+    cfg.autocast = records.run_config(folder).autocast
+    if changed := records.changes(folder, configuration.planned(cfg).config):
         raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another --output")
 
 

@@ -13,7 +13,7 @@ from torchrl_mcp.commands.task_settings import task_settings
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build, policies
+from torchrl_mcp.runs import build, configuration, policies
 from torchrl_mcp.runs.build import Agent
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.viewer.film import save_film
@@ -85,9 +85,9 @@ def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Charact
     """Return an untrained policy, and the environment of a configuration."""
     own = [f"hydra.searchpath=[file://{arguments.config_dir.resolve()}]"] if arguments.config_dir else []
     try:
-        cfg = build.compose_run(*own, *arguments.settings)
+        cfg = configuration.compose_run(*own, *arguments.settings)
         if cfg.stage.name not in cfg.task:
-            cfg = build.compose_run(*own, *arguments.settings, "stage=transfer")
+            cfg = configuration.compose_run(*own, *arguments.settings, "stage=transfer")
     except HydraException as error:
         raise ValueError(str(error)) from error
     env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **task_settings(arguments.task))

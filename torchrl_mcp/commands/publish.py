@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
-from torchrl_mcp.runs import experiment, policies
+from torchrl_mcp.runs import policies, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.identity import CONDUCT, is_among
 from torchrl_mcp.training import checkpoint, run_folder
@@ -30,7 +30,7 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     Raises:
         ValueError: If the folder holds no run, or its policy cannot be published.
     """
-    cfg = experiment.run_config(run)
+    cfg = records.run_config(run)
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}

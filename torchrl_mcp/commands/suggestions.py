@@ -101,9 +101,9 @@ def _is_argument(key: str, cfg: DictConfig) -> bool:
     made = group and OmegaConf.select(cfg, f"{group}._target_")
     if not made:
         return False
-    from torchrl_mcp.runs import build  # takes seconds
+    from torchrl_mcp.runs import requirements  # takes seconds
 
-    return name in build.arguments(made)
+    return name in requirements.arguments(made)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

@@ -120,7 +120,7 @@ def run_benchmark(arguments: list[str]) -> None:
 
 def _resume(cfg: DictConfig) -> Path:
     """Continue the run in ``cfg.resume`` with the few settings that a run can change."""
-    from torchrl_mcp.runs import experiment
+    from torchrl_mcp.runs import experiment, records
 
     folder, given = Path(cfg.resume), HydraConfig.get().overrides.task
     overrides = OverridesParser.create().parse_overrides(list(given))
@@ -133,6 +133,6 @@ def _resume(cfg: DictConfig) -> Path:
             "a resumed run keeps its settings, except for device, a larger training.total_frames and the places of "
             f"files: leave out {' '.join(ignored)}"
         )
-    if experiment.is_complete(folder) and total_frames is None:
+    if records.is_complete(folder) and total_frames is None:
         print(f"{folder} is complete: nothing is left to do; training.total_frames=N makes it longer")
     return experiment.resume(folder, device=device, total_frames=total_frames, moves=moves)

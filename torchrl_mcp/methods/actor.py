@@ -15,6 +15,7 @@ the primitives are frozen, the exploration acts on the gate, or noise enters bef
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from tensordict import NestedKey
 from tensordict.nn import (
@@ -43,6 +44,20 @@ Explorer = Callable[[Tensor], Tensor]
 """
 
 
+class Sizes(NamedTuple):
+    """Sizes of what a method's networks see and do.
+
+    Attributes:
+        observation: Size of the state, ``S``.
+        goal: Size of the goal, ``G``.
+        action: Size of the action, ``A``.
+    """
+
+    observation: int
+    goal: int
+    action: int
+
+
 @dataclass(frozen=True)
 class Actor:
     """A policy in parts.
@@ -67,17 +82,12 @@ class Actor:
         return f"{self.sampled}_log_prob"
 
 
-def input_normalisers(
-    observation_dim: int, goal_dim: int, normaliser: Callable[[int], RunningNormaliser]
-) -> dict[str, nn.Module]:
-    """Make the parts that :func:`normalise_inputs` needs.
-
-    Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        normaliser: Makes an input normaliser from a size.
-    """
-    return {"observation_normaliser": normaliser(observation_dim), "goal_normaliser": normaliser(goal_dim)}
+def input_normalisers(sizes: Sizes) -> dict[str, nn.Module]:
+    """Make the parts that :func:`normalise_inputs` needs: ``observation_normaliser`` and ``goal_normaliser``."""
+    return {
+        "observation_normaliser": RunningNormaliser(sizes.observation),
+        "goal_normaliser": RunningNormaliser(sizes.goal),
+    }
 
 
 def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:

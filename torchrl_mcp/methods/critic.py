@@ -6,24 +6,18 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
-from torchrl_mcp.methods.actor import GOAL, STATE, normalise_inputs
+from torchrl_mcp.methods.actor import GOAL, STATE, Sizes, normalise_inputs
 from torchrl_mcp.modules.gating import scaled_cells
 
 
 def value_critic(
-    parts: nn.ModuleDict,
-    observation_dim: int,
-    goal_dim: int,
-    *,
-    num_cells: Sequence[int] = (1024, 512),
-    width: float = 1.0,
+    parts: nn.ModuleDict, sizes: Sizes, *, num_cells: Sequence[int] = (1024, 512), width: float = 1.0
 ) -> TensorDictSequential:
     """Add the part ``critic``, V(s, g), and return it as a module from ``observation`` and ``goal`` to ``state_value``.
 
     Args:
         parts: Parts of the actor, whose normalisers the critic shares; receives the critic.
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
+        sizes: Sizes of state, goal and action.
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
 
@@ -31,7 +25,7 @@ def value_critic(
         Peng et al., *MCP*, NeurIPS 2019, Section E.1. https://arxiv.org/abs/1905.09808
     """
     parts["critic"] = MLP(
-        in_features=observation_dim + goal_dim,
+        in_features=sizes.observation + sizes.goal,
         out_features=1,
         num_cells=scaled_cells(num_cells, width),
         activation_class=nn.ReLU,

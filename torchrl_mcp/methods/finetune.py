@@ -25,36 +25,24 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Sizes, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.modules.injection import InjectedPolicy, InputInjection
-from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 
-def injected_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
-    *,
-    policy: Callable[[int, int], InjectedPolicy],
-    blind: bool,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
-) -> nn.ModuleDict:
+def injected_parts(sizes: Sizes, *, policy: Callable[[int, int], InjectedPolicy], blind: bool) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``policy`` and ``goal_input``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         policy: Makes the network from ``(S, A)``.
         blind: Leave the weights of the goal at zero.
-        normaliser: Makes an input normaliser from a size.
     """
-    network = policy(observation_dim, action_dim)
+    network = policy(sizes.observation, sizes.action)
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
+            **input_normalisers(sizes),
             "policy": network,
-            "goal_input": InputInjection(goal_dim, network.input.out_features).requires_grad_(not blind),
+            "goal_input": InputInjection(sizes.goal, network.input.out_features).requires_grad_(not blind),
         }
     )
 

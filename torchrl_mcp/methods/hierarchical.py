@@ -8,63 +8,39 @@ from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.methods.options import OptionActor, RandomSequence, WhereBeginning, keep_option
-from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 
-def primitive_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
-    *,
-    primitives: Callable[..., nn.Module],
-    num_options: int,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
-) -> nn.ModuleDict:
+def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: int) -> nn.ModuleDict:
     """Make the parts of pre-training: ``observation_normaliser``, ``goal_normaliser`` and ``primitives``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``, which only the critic sees.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         primitives: Makes the primitives from ``(S, A, K)``.
         num_options: Number of options, ``K``, each of which is a primitive.
-        normaliser: Makes an input normaliser from a size.
     """
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
-            "primitives": primitives(observation_dim, action_dim, num_options),
+            **input_normalisers(sizes),
+            "primitives": primitives(sizes.observation, sizes.action, num_options),
         }
     )
 
 
 def gated_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
-    *,
-    gating: Callable[..., nn.Module],
-    primitives: Callable[..., nn.Module],
-    num_options: int,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+    sizes: Sizes, *, gating: Callable[..., nn.Module], primitives: Callable[..., nn.Module], num_options: int
 ) -> nn.ModuleDict:
     """Make the parts of transfer: the parts of :func:`primitive_parts` and ``gating``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         gating: Makes the network for the logits of the choice from ``(S, G, K)``.
         primitives: Makes the primitives from ``(S, A, K)``.
         num_options: Number of options, ``K``, each of which is a primitive.
-        normaliser: Makes an input normaliser from a size.
     """
-    parts = primitive_parts(
-        observation_dim, goal_dim, action_dim, primitives=primitives, num_options=num_options, normaliser=normaliser
-    )
-    parts["gating"] = gating(observation_dim, goal_dim, num_options)
+    parts = primitive_parts(sizes, primitives=primitives, num_options=num_options)
+    parts["gating"] = gating(sizes.observation, sizes.goal, num_options)
     return parts
 
 
@@ -119,15 +95,7 @@ def gated_actor(
 def random_sequence(
     parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
 ) -> Explorer:
-    """Return an explorer that lets one primitive act after another in random order.
-
-    Args:
-        parts: Made by :func:`primitive_parts`.
-        num: Number of simulations, ``N``.
-        generator: Source of randomness.
-        num_options: Number of primitives, ``K``.
-        steps: Control steps for which each acts.
-    """
+    """Return a :class:`.RandomSequence` of the primitives in the parts of :func:`primitive_parts`."""
     return RandomSequence(parts["primitives"], num, generator, num_options=num_options, steps=steps)
 
 

@@ -25,8 +25,7 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.modules.normaliser import RunningNormaliser
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
 
 NOISE = ("latent", "noise")
 ENCODING = (("latent", "loc"), ("latent", "scale"))
@@ -34,25 +33,15 @@ LATENT = ("latent", "sample")
 
 
 def latent_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
-    *,
-    encoder: Callable[..., nn.Module],
-    decoder: Callable[..., nn.Module],
-    latent_dim: int,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
+    sizes: Sizes, *, encoder: Callable[..., nn.Module], decoder: Callable[..., nn.Module], latent_dim: int
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``encoder`` and ``decoder``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         encoder: Makes the network for mean and standard deviation of the latent variable from ``(S, G, L)``.
         decoder: Makes the network for mean and standard deviation of the action from ``(S, L, A)``.
         latent_dim: Size of the latent variable, ``L``.
-        normaliser: Makes an input normaliser from a size.
 
     Raises:
         ValueError: If ``latent_dim`` is not positive.
@@ -61,9 +50,9 @@ def latent_parts(
         raise ValueError(f"latent_dim must be at least 1, got {latent_dim}")
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
-            "encoder": encoder(observation_dim, goal_dim, latent_dim),
-            "decoder": decoder(observation_dim, latent_dim, action_dim),
+            **input_normalisers(sizes),
+            "encoder": encoder(sizes.observation, sizes.goal, latent_dim),
+            "decoder": decoder(sizes.observation, latent_dim, sizes.action),
         }
     )
 

@@ -17,18 +17,16 @@ from torchrl_mcp.methods.actor import (
     Actor,
     Composition,
     Explorer,
+    Sizes,
     input_normalisers,
     normalise_inputs,
     sampler,
 )
-from torchrl_mcp.modules.normaliser import RunningNormaliser
 from torchrl_mcp.modules.primitives import Primitives
 
 
 def composite_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
+    sizes: Sizes,
     *,
     gating: Callable[..., nn.Module],
     gate_activation: Callable[[Tensor], Tensor],
@@ -36,14 +34,11 @@ def composite_parts(
     num_primitives: int,
     distribution_class: Composition,
     initial_std: float,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating`` and ``primitives``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         gating: Makes the network for gate logits from ``(S, G, K)``.
         gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
         primitives: Makes the primitives from ``(S, A, K, initial_std=)``; they need a method ``rescale`` like
@@ -53,7 +48,6 @@ def composite_parts(
         initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixer. It
             includes the variance of each primitive and the variance between their means, and is a root mean square over
             normalised states and actions.
-        normaliser: Makes an input normaliser from a size.
 
     Raises:
         ValueError: If ``num_primitives`` is not positive.
@@ -65,18 +59,18 @@ def composite_parts(
     gates = gate_activation(torch.zeros(num_primitives))
     unit = torch.ones(num_primitives, 1)
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
-    gate = gating(observation_dim, goal_dim, num_primitives)
+    gate = gating(sizes.observation, sizes.goal, num_primitives)
     networks = primitives(
-        observation_dim, action_dim, num_primitives, initial_std=initial_std / composite.stddev.item()
+        sizes.observation, sizes.action, num_primitives, initial_std=initial_std / composite.stddev.item()
     )
     with torch.no_grad():
-        states, goals = _normalised_inputs(observation_dim, goal_dim)
+        states, goals = _normalised_inputs(sizes.observation, sizes.goal)
         loc, scale = networks(states)
         composite = distribution_class(loc, scale, gate_activation(gate(states, goals)))
         networks.rescale(initial_std / composite.stddev.square().mean().sqrt().item())
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
+            **input_normalisers(sizes),
             "gating": gate,
             "primitives": networks,
         }

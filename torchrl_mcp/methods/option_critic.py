@@ -27,7 +27,16 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.modules import MLP, IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, PRIMITIVES, STATE, Explorer, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.actor import (
+    GOAL,
+    PRIMITIVES,
+    STATE,
+    Explorer,
+    Sizes,
+    input_normalisers,
+    normalise_inputs,
+    sampler,
+)
 from torchrl_mcp.methods.options import (
     EpsilonGreedy,
     OptionActor,
@@ -37,43 +46,36 @@ from torchrl_mcp.methods.options import (
     of_option,
 )
 from torchrl_mcp.modules.gating import scaled_cells
-from torchrl_mcp.modules.normaliser import RunningNormaliser
 
 ARRIVAL = ("next", "observation")
 
 
 def option_critic_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
+    sizes: Sizes,
     *,
     options: Callable[..., nn.Module],
     terminations: Callable[..., nn.Module],
     values_cells: Sequence[int],
     num_options: int,
     width: float = 1.0,
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``options``, ``terminations`` and ``critic``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         options: Makes the network of all options, from a state to means and standard deviations, from ``(S, A, K)``.
         terminations: Makes the termination network of all options from ``(S, K)``.
         values_cells: Hidden units of the critic.
         width: Factor on ``values_cells``.
         num_options: Number of options, ``K``.
-        normaliser: Makes an input normaliser from a size.
     """
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
-            "options": options(observation_dim, action_dim, num_options),
-            "terminations": terminations(observation_dim, num_options),
+            **input_normalisers(sizes),
+            "options": options(sizes.observation, sizes.action, num_options),
+            "terminations": terminations(sizes.observation, num_options),
             "critic": MLP(
-                in_features=observation_dim + goal_dim,
+                in_features=sizes.observation + sizes.goal,
                 out_features=num_options,
                 num_cells=scaled_cells(values_cells, width),
                 activation_class=nn.ReLU,
@@ -120,13 +122,12 @@ def option_critic_actor(
     return OptionActor(policy, trained, stored=("option", "begins"), num_options=num_options)
 
 
-def option_values(parts: nn.ModuleDict, observation_dim: int, goal_dim: int) -> TensorDictSequential:
+def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:
     r"""Return the critic: from ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
 
     Args:
         parts: Made by :func:`option_critic_parts`, whose ``critic`` is :math:`Q_\Omega(s, g, \omega)`.
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
+        sizes: Sizes of state, goal and action.
     """
     return TensorDictSequential(
         normalise_inputs(parts),
@@ -138,15 +139,7 @@ def option_values(parts: nn.ModuleDict, observation_dim: int, goal_dim: int) -> 
 def random_sequence(
     parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
 ) -> Explorer:
-    """Return an explorer that lets one option act after another in random order.
-
-    Args:
-        parts: Made by :func:`option_critic_parts`.
-        num: Number of simulations, ``N``.
-        generator: Source of randomness.
-        num_options: Number of options, ``K``.
-        steps: Control steps for which each acts.
-    """
+    """Return a :class:`.RandomSequence` of the options in the parts of :func:`option_critic_parts`."""
 
     def options(state: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = parts["options"](state)

@@ -6,31 +6,20 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Actor, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.modules.normaliser import RunningNormaliser
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Sizes, input_normalisers, normalise_inputs, sampler
 
 
-def gaussian_parts(
-    observation_dim: int,
-    goal_dim: int,
-    action_dim: int,
-    *,
-    policy: Callable[..., nn.Module],
-    normaliser: Callable[[int], RunningNormaliser] = RunningNormaliser,
-) -> nn.ModuleDict:
+def gaussian_parts(sizes: Sizes, *, policy: Callable[..., nn.Module]) -> nn.ModuleDict:
     """Make the parts of the scratch model: ``observation_normaliser``, ``goal_normaliser`` and ``policy``.
 
     Args:
-        observation_dim: Size of the state, ``S``.
-        goal_dim: Size of the goal, ``G``.
-        action_dim: Size of the action, ``A``.
+        sizes: Sizes of state, goal and action.
         policy: Makes the network for mean and standard deviation from ``(S, G, A)``.
-        normaliser: Makes an input normaliser from a size.
     """
     return nn.ModuleDict(
         {
-            **input_normalisers(observation_dim, goal_dim, normaliser),
-            "policy": policy(observation_dim, goal_dim, action_dim),
+            **input_normalisers(sizes),
+            "policy": policy(sizes.observation, sizes.goal, sizes.action),
         }
     )
 

@@ -45,18 +45,7 @@ class StateGoalEncoder(nn.Module):
 
 
 class GoalEncoder(StateGoalEncoder):
-    r"""The encoder of pre-training, :math:`q(w|g)`, which does not look at the state.
-
-    Args:
-        observation_dim: Size of the state, which is not used.
-        goal_dim: Size of the goal, ``G``.
-        latent_dim: Size of the latent variable, ``L``.
-        num_cells: Hidden units.
-        width: Factor on all numbers of hidden units.
-
-    Reference:
-        Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
-    """
+    """The encoder of pre-training, :math:`q(w|g)`, with the same arguments, which does not look at the state."""
 
     def __init__(
         self,

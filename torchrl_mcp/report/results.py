@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from omegaconf import OmegaConf
 
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import configuration
 from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.trust import read_config
 from torchrl_mcp.training.run_folder import (
@@ -295,4 +295,5 @@ def _about(method: str) -> dict[str, Any]:
     known = files("torchrl_mcp.conf").joinpath("method").iterdir()
     if f"{method}.yaml" not in {file.name for file in known}:
         return {}
-    return cast("dict[str, Any]", OmegaConf.to_container(build.compose_run(f"method={method}").method, resolve=True))
+    cfg = configuration.compose_run(f"method={method}")
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg.method, resolve=True))

@@ -9,7 +9,7 @@ refuses folders with other settings.
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -27,8 +27,10 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from torchrl_mcp.runs import build, experiment, quoting
+from torchrl_mcp.runs import experiment, quoting, records
+from torchrl_mcp.runs.configuration import planned
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
+from torchrl_mcp.runs.requirements import require_environment
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.runs.trust import targets, trusting
 from torchrl_mcp.training.run_folder import CONFIG, LOG
@@ -174,17 +176,26 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     """Return the run with these settings, in its configured folder."""
     overrides = [f"{key}={value}" for key, value in {**settings, "progress_bar": "false"}.items()]
     cfg = loader.load_sweep_config(master, overrides)
-    former = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(cfg)  # interpolations may refer to it
-    try:
+    with _current(cfg):
         with read_write(cfg), open_dict(cfg):
             del cfg["hydra"]
-        build.require_valid(cfg)
-        build.require_environment(cfg)
-        config, folder = build.stored(experiment.settled(cfg)), Path(cfg.run_dir)
+        plan = planned(cfg)
+        require_environment(plan.cfg)
+    return Job(plan.folder, overrides, plan.config)
+
+
+@contextmanager
+def _current(cfg: DictConfig) -> Iterator[None]:
+    """Let ``${hydra:...}`` refer to a configuration while the block runs.
+
+    Hydra documents how to set it, but has no function to return to the former one: its own jobs assign ``cfg``, too.
+    """
+    former = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(cfg)
+    try:
+        yield
     finally:
         HydraConfig.instance().cfg = former
-    return Job(folder, overrides, config)
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:
@@ -207,7 +218,7 @@ def conflict(job: Job) -> str | None:
     """Return why a job cannot use its folder, or None."""
     if not (job.folder / CONFIG).exists():
         return None
-    if not (changed := experiment.changes(job.folder, job.config)):
+    if not (changed := records.changes(job.folder, job.config)):
         return None
     return f"{job.folder} differs in {', '.join(changed)}: keep it, and choose another run_root"
 
@@ -240,7 +251,7 @@ def run(cfg: DictConfig) -> None:
 
 def is_complete(folder: Path) -> bool:
     """Return whether a folder holds a finished and evaluated run."""
-    return (folder / CONFIG).exists() and experiment.is_complete(folder)
+    return (folder / CONFIG).exists() and records.is_complete(folder)
 
 
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:

@@ -9,6 +9,9 @@ REMOVED = {"failure_weighting": 0.0, "shaping": {}}
 AIDS = ("initial_states", "mixture", "emphasis", "staggered", "discount")
 """Settings of environments that are one setting in this version, ``curriculum``."""
 
+ENGINES = {"mujoco": "mujoco_threads", "warp": "mujoco_warp"}
+"""Functions of engines by their names, which earlier versions wrote."""
+
 PLACES = ("pretrain", "transfer", "evaluation")
 """Groups of ``task`` that hold settings of environments."""
 
@@ -22,6 +25,9 @@ def translated(config: Mapping[str, Any]) -> dict[str, Any]:
         config: The configuration of a run of this version or an earlier one.
     """
     made = _without(config)
+    if isinstance(engine := made.get("physics", "mujoco"), str):
+        target = f"torchrl_mcp.envs.physics.engines.{ENGINES[engine]}"
+        made["physics"] = {"engine": {"_target_": target, "_partial_": True}, "on_device": engine == "warp"}
     if "task" in made:
         places = {name: _with_curriculum(made["task"][name]) for name in PLACES if name in made["task"]}
         made["task"] = made["task"] | places

@@ -28,7 +28,7 @@ LEVELS = ("task", "character", "stage", "method", "seed")
 """Settings that are a level each of the path of a run folder."""
 
 UNNAMED = CONDUCT | PLACES | {*LEVELS, "autocast", "evaluation.episodes", "evaluation.seed"}
-"""Settings that are not in the name of a run folder: ``exclude_keys`` of ``conf/train.yaml``."""
+"""Settings that are not in the name of a run folder, for the resolver ``unnamed`` of ``conf/train.yaml``."""
 
 ENVIRONMENTS = frozenset(
     {"benchmark", "evaluation", "imitation", "motions", "curriculum", "task.evaluation", "task.curriculum"}

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from torchrl_mcp.training.run_folder import remove_leftovers
+
 LOCK = ".lock"
 """The locked file. It contains the holder's name, and remains only if the holder was killed."""
 
@@ -52,7 +54,9 @@ else:
 
 @contextmanager
 def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold the lock of a run folder while the block runs. Missing folders are created, and removed if they stay empty.
+    """Hold the lock of a run folder while the block runs, first without what killed processes have left there.
+
+    Missing folders are created, and removed if they stay empty.
 
     Args:
         folder: The run folder.
@@ -70,6 +74,7 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
             file.write(f"process {os.getpid()} on {socket.gethostname()}")
             file.flush()
             try:
+                remove_leftovers(folder)
                 yield
             finally:
                 _remove(folder, made)

@@ -8,8 +8,10 @@ import hashlib
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from zipfile import ZipFile, is_zipfile
+
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
@@ -51,12 +53,10 @@ def outside(config: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
-def stored(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration with absolute paths.
-
-    Args:
-        config: The resolved configuration, with :data:`HERE` as ``run_dir``.
-    """
+def stored(cfg: DictConfig) -> dict[str, Any]:
+    """Return a run's configuration as it is stored: resolved, and valid wherever the run folder is."""
+    here = OmegaConf.merge(cfg, {"run_dir": HERE, "run_root": HERE})
+    config = cast("dict[str, Any]", OmegaConf.to_container(here, resolve=True))
     moves = {value: str(Path(value).absolute()) for _, value in settings(config)}
     return moved(config, moves)
 

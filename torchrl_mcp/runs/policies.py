@@ -13,7 +13,7 @@ from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.runs import build, places
+from torchrl_mcp.runs import places, requirements
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import translated
@@ -32,7 +32,7 @@ def policy_config(path: Path) -> DictConfig:
     """
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
-    build.require_known(config, file)
+    requirements.require_known(config, file)
     return OmegaConf.create(translated(config))
 
 
@@ -91,45 +91,27 @@ def publish_run(path: Path, output: Path) -> None:
 
 
 def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
-    """Return the content of ``evaluation.json``: :func:`evaluate_run` in the environments of the run's configuration.
+    """Evaluate a run's policy, and return the content of ``evaluation.json``.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Episodes, one per environment.
         seed: Seed of environments and sampling.
-        **kwargs: Further arguments of the environments.
+        **kwargs: Arguments of the environments, beside those that the run's configuration has for evaluations.
 
     Returns:
-        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, ``deterministic`` and
-        ``stochastic``.
+        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, and for the policy
+        ``deterministic`` and ``stochastic``, the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics`, with the
+        :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
     Raises:
         ValueError: If there is no checkpoint or it is damaged.
     """
     settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     environment = {**settings["environment"], **kwargs}
-    numbers = evaluate_run(path, episodes=episodes, seed=seed, **environment)
-    return {"episodes": episodes, "seed": seed, "environment": environment, **numbers}
-
-
-def evaluate_run(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, dict]:
-    """Return statistics of a run's policy, ``deterministic`` and ``stochastic``.
-
-    Each is the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics` of the episodes, with the
-    :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
-
-    Args:
-        path: Run folder, for its newest checkpoint, or checkpoint file.
-        episodes: Episodes, one per environment.
-        seed: Seed of environments and sampling.
-        **kwargs: Arguments of the environments that replace the run's own.
-
-    Raises:
-        ValueError: If there is no checkpoint or it is damaged.
-    """
-    results = {}
+    results: dict[str, Any] = {"episodes": episodes, "seed": seed, "environment": environment}
     for mode in ("deterministic", "stochastic"):
-        _, agent, env = restore(path, num_envs=episodes, seed=seed, **kwargs)
+        _, agent, env = restore(path, num_envs=episodes, seed=seed, **environment)
         torch.manual_seed(seed)
         record = diagnosed(agent.actor)
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)

@@ -2,10 +2,13 @@
 
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
 
 from torchrl_mcp import __version__
 from torchrl_mcp.runs.machine import machine
@@ -14,15 +17,11 @@ from torchrl_mcp.training.precision import Precision
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def provenance(
-    device: str, command: Sequence[str], choices: Mapping[str, str], precision: Precision, inputs: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the provenance of a run, JSON-compatible.
+def provenance(device: str, precision: Precision, inputs: Mapping[str, str]) -> dict[str, Any]:
+    """Return the provenance of a run that begins, JSON-compatible.
 
     Args:
         device: Device of the networks.
-        command: Words of the command that started the run.
-        choices: Choice of each group of the configuration.
         precision: Precision of the networks.
         inputs: Digests of the files outside the run folder, by the names of their settings.
 
@@ -31,11 +30,12 @@ def provenance(
         checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``inputs``; ``started``, an ISO
         time; and the ``machine``.
     """
+    command, choices = launched()
     return {
-        "command": list(command),
+        "command": command,
         "commit": commit(PACKAGE),
         "version": __version__,
-        "choices": dict(choices),
+        "choices": choices,
         "precision": str(precision),
         "inputs": dict(inputs),
         "started": _now(),
@@ -43,14 +43,11 @@ def provenance(
     }
 
 
-def continuation(
-    origin: Mapping[str, Any], command: Sequence[str], planned: int, total: int, frames: int
-) -> dict[str, Any]:
+def continuation(origin: Mapping[str, Any], planned: int, total: int, frames: int) -> dict[str, Any]:
     """Return the provenance of a run that becomes longer than planned.
 
     Args:
         origin: The provenance so far.
-        command: Words of the command that makes it longer.
         planned: Environment steps of the run so far.
         total: Environment steps of the run from now on.
         frames: Environment steps that it has taken.
@@ -58,8 +55,18 @@ def continuation(
     Returns:
         ``origin`` with one more entry in ``extended``.
     """
-    entry = {"command": list(command), "started": _now(), "planned": planned, "total_frames": total, "after": frames}
+    entry = {"command": launched()[0], "started": _now(), "planned": planned, "total_frames": total, "after": frames}
     return {**origin, "extended": [*origin.get("extended", []), entry]}
+
+
+def launched() -> tuple[list[str], dict[str, str]]:
+    """Return command line and choices of config groups, of the run that Hydra launched or of this process."""
+    if not HydraConfig.initialized():
+        return list(sys.argv), {}
+    hydra = HydraConfig.get()
+    made = hydra.runtime.choices.items()
+    choices = {group: choice for group, choice in made if choice and not group.startswith("hydra/")}
+    return ["torchrl-mcp-train", *hydra.overrides.task], choices
 
 
 def commit(folder: Path) -> str | None:

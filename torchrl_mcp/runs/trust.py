@@ -5,7 +5,7 @@ configuration may only call names in the library's own files and names that the 
 """
 
 import pkgutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -35,7 +35,7 @@ _trusted: ContextVar[frozenset[str]] = ContextVar("trusted", default=frozenset()
 
 
 @contextmanager
-def trusting(names: Collection[str]) -> Iterator[None]:
+def trusting(names: Iterable[str]) -> Iterator[None]:
     """Trust further names in configurations from files while the block runs.
 
     Args:

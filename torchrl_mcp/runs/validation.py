@@ -6,6 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchrl_mcp.envs.pd_character import CONES
+from torchrl_mcp.envs.tasks.imitation import CLIP_ENDS, SWITCHES
+from torchrl_mcp.envs.tasks.transport import POSITIONS
+
 
 class Rule(NamedTuple):
     """A rule for the value of a setting.
@@ -50,6 +54,7 @@ POSITIVE = Rule("a finite number above 0", lambda value: _is_number(value) and v
 NOT_NEGATIVE = Rule("a finite number, at least 0", lambda value: _is_number(value) and value >= 0)
 SHARE = Rule("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1)
 DISCOUNT = Rule("a number from 0 to 1, below 1", lambda value: _is_number(value) and 0 <= value < 1)
+PROBABILITY = Rule("a number between 0 and 1", lambda value: _is_number(value) and 0 < value < 1)
 PERIOD = Rule("a number above 0, or .inf", lambda value: value == math.inf or POSITIVE.allows(value))
 FLAG = Rule("true or false", lambda value: isinstance(value, bool))
 TEXT = Rule("a text", lambda value: isinstance(value, str) and bool(value))
@@ -89,13 +94,14 @@ NAMES_BY_RULE: dict[Rule, str] = {
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     DISCOUNT: "gamma",
+    PROBABILITY: "terminations.initial",
     SHARE: """
-        lmbda discount epsilon momentum terminations.initial initial_states.rest
+        lmbda discount epsilon momentum initial_states.rest
         initial_states.motions motion_starts
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind random_first_length restart_noise
+        terminate_when_unhealthy success_reward parts.blind on_device random_first_length restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
@@ -110,10 +116,10 @@ NAMES_BY_RULE: dict[Rule, str] = {
     TEXT: "device run_dir run_root",
     TEXT.or_null(): "pretrained resume",
     _among(True, False, "auto"): "autocast",
-    _among("any", "same"): "switch_to",
-    _among("pyramidal", "elliptic"): "friction_cone",
-    _among("mujoco", "warp"): "physics",
-    _among("metres", "logarithmic"): "goal_positions",
+    _among(*SWITCHES): "switch_to",
+    _among(*CLIP_ENDS): "clip_end",
+    _among(*CONES): "friction_cone",
+    _among(*POSITIONS): "goal_positions",
 }
 
 RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}

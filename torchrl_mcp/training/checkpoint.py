@@ -5,10 +5,9 @@ manifest that holds the run's configuration and the library versions. Every part
 component, so that transfer can load only the parts that it keeps.
 """
 
-import re
 import zlib
 from collections.abc import Collection, Mapping
-from logging import LogRecord
+from logging import ERROR
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -24,9 +23,6 @@ FOLDER = CHECKPOINTS
 
 DAMAGED = ".damaged"
 """Suffix of the name of a checkpoint that could not be restored."""
-
-REFUSAL = re.compile(r"unable to .*file <.*: (.*)", re.DOTALL)
-"""Torch's error message when the system refuses to write a file, with the system's reason."""
 
 # Exceptions of torchrl, tensordict, zipfile and json when a file is damaged or of another kind.
 UNREADABLE = (
@@ -81,17 +77,21 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint file {path}")
+    level = torchrl_logger.level
+    torchrl_logger.setLevel(ERROR)  # it also warns of another build of a version, as for CUDA
     try:
         _require_plain_data(path)
-        torchrl_logger.addFilter(_tells_of_another_version)
-        checkpoint.load(path, components=components, map_location="cpu")
+        report = checkpoint.load(path, components=components, map_location="cpu")
     except UNREADABLE as error:
         raise ValueError(
             f"cannot restore {path}: {error}. The file is damaged or belongs to a different method, character, task or "
             "network size; give a checkpoint of the same configuration"
         ) from error
     finally:
-        torchrl_logger.removeFilter(_tells_of_another_version)
+        torchrl_logger.setLevel(level)
+    versions = report.comparison.get("versions", {})
+    if other := [name for name, pair in versions.items() if _plain(pair["checkpoint"]) != _plain(pair["runtime"])]:
+        torchrl_logger.warning(f"{path} was written with another version of {', '.join(other)}")
 
 
 def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None:
@@ -133,10 +133,8 @@ def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, 
     try:
         with replacing(path) as partial:
             checkpoint.save(partial, metadata={"config": config})
-    except RuntimeError as error:
-        if not (refusal := REFUSAL.match(str(error))):
-            raise
-        raise OSError(f"cannot write {path}: {refusal[1]}") from error
+    except RuntimeError as error:  # torch's form of what the system refuses
+        raise OSError(f"cannot write {path}: {error}") from error
     checkpoints.prune()
 
 
@@ -211,10 +209,9 @@ def _require_plain_data(path: Path) -> None:
             raise CheckpointError("it would unpack to more than its own size, which no checkpoint of torchrl-mcp does")
 
 
-def _tells_of_another_version(record: LogRecord) -> bool:
-    """Return whether to log a warning of TorchRL about versions: builds of one version, as for CUDA, do not count."""
-    pairs = re.findall(r"checkpoint='([^'+]*)[^']*', runtime='([^'+]*)[^']*'", record.getMessage())
-    return not pairs or any(checkpoint != runtime for checkpoint, runtime in pairs)
+def _plain(version: str) -> str:
+    """Return a version without its build, such as ``+cpu``."""
+    return version.partition("+")[0]
 
 
 def _component(part: str) -> str:

@@ -1,7 +1,8 @@
 """Access control for MuJoCo Studio's web server: by default this machine alone, and never pages of other sites.
 
 Studio listens on every interface, lets the first visitor control the simulation, loads uploaded models, and has no
-setting for any of this (MuJoCo 3.17). This module sets the address to listen on and checks every request.
+setting for any of this. This module sets the address to listen on and checks every request, by replacing functions of
+Studio: :func:`guarded` is the one place that does, and refuses versions in which nobody has seen it work.
 """
 
 import logging
@@ -13,8 +14,12 @@ from ipaddress import IPv6Address, ip_address
 from typing import Any
 from urllib.parse import urlsplit
 
+import mujoco
 from mujoco.experimental.studio import web_viewer
 from mujoco.experimental.studio.web import web_server
+
+VERIFIED = "3.17"
+"""MuJoCo's version with which ``tests/viewer/test_web.py`` passes, which asks a guarded page from outside."""
 
 HERE = "127.0.0.1"
 """Address for access from this machine alone."""
@@ -33,7 +38,15 @@ def guarded(host: str) -> Iterator[None]:
     """Let viewers that the block opens listen on ``host`` alone, and check requests with :func:`refusal`.
 
     The viewer logs warnings alone, not every connection of a browser.
+
+    Raises:
+        RuntimeError: If this is another version of MuJoCo, in which Studio may call other functions.
     """
+    if not mujoco.__version__.startswith(f"{VERIFIED}."):
+        raise RuntimeError(
+            f"who may see a page of MuJoCo {mujoco.__version__} is not known: install mujoco {VERIFIED}, or use "
+            "--viewer window"
+        )
     level = web_server.logger.level
     web_server.logger.setLevel(logging.WARNING)
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner

@@ -1,0 +1,89 @@
+"""The configuration of a run: composed by Hydra, checked, and completed to the plan of a run."""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_mcp.runs import places, validation
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.training import checkpoint
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run before anything is built or written.
+
+    Attributes:
+        cfg: The configuration, with the widths of loaded networks: of those that transfer keeps, else of all.
+        folder: The run folder.
+        initial: Checkpoint file of the initial networks, or None for untrained networks.
+        config: The configuration as the run folder will hold it, but for an ``autocast`` of ``auto``.
+    """
+
+    cfg: DictConfig
+    folder: Path
+    initial: Path | None
+    config: dict[str, Any]
+
+
+def compose_run(*overrides: str) -> DictConfig:
+    """Return the configuration of ``torchrl-mcp-train`` with these arguments."""
+    begun = GlobalHydra.instance().is_initialized()  # true on the command line
+    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        return compose("train", list(overrides))
+
+
+def planned(cfg: DictConfig) -> Plan:
+    """Return the plan of a run.
+
+    Raises:
+        ValueError: As :func:`require_valid`, or if there is no such pre-training.
+    """
+    config = require_valid(cfg)
+    where = {name: config[name] for name in ("run_dir", "run_root")}
+    initial = initial_networks(cfg)
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _widths(cfg, initial)))
+    return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
+
+
+def require_valid(cfg: DictConfig) -> dict[str, Any]:
+    """Check the values of all settings, and return them with references resolved.
+
+    Raises:
+        ValueError: As :func:`.validation.require_valid`, or if a setting refers to one that is missing.
+    """
+    try:
+        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+    except OmegaConfBaseException as error:
+        raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
+    validation.require_valid(config)
+    return config
+
+
+def initial_networks(cfg: DictConfig) -> Path | None:
+    """Return the checkpoint file from which a run takes networks, or None if it takes none.
+
+    Raises:
+        ValueError: If there is no such pre-training.
+    """
+    if cfg.pretrained is None or (cfg.stage.name == "transfer" and not cfg.transfer.keep):
+        return None
+    if cfg.pretrained == places.BUILTIN:
+        return builtin(cfg.method.name, cfg.character.name)
+    return checkpoint.find(Path(cfg.pretrained))
+
+
+def _widths(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
+    """Return the widths of the networks that a run takes from a checkpoint file."""
+    if initial is None:
+        return {}
+    saved = checkpoint.saved_config(initial)
+    width = saved.get("width", 1.0)  # older networks have the paper's
+    kept = {"kept_width": saved.get("kept_width", width)}
+    return kept if cfg.stage.name == "transfer" else {**kept, "width": width}

@@ -1,0 +1,184 @@
+"""What a run needs beside valid settings: an environment, files, devices, networks, and classes that exist."""
+
+import inspect
+import pkgutil
+from collections.abc import Collection, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.runs import places
+from torchrl_mcp.runs.builtin import FOLDER
+from torchrl_mcp.runs.trust import require_trusted, targets
+
+
+def require_all(cfg: DictConfig) -> None:
+    """Check, before its folder is made or used, that a run can be made on this machine.
+
+    Raises:
+        ValueError: As the functions below, of which the last checks that there are networks to transfer.
+    """
+    require_environment(cfg)
+    require_files(cfg, cfg.task[cfg.stage.name])
+    require_equipment(cfg)
+    if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
+        ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
+        raise ValueError(
+            f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
+            "give its run folder as pretrained=<folder>"
+            + (", or take the networks that come with the library: pretrained=builtin" if ours else "")
+        )
+
+
+def require_environment(cfg: DictConfig) -> None:
+    """Check that there is an environment for the configured task, stage and character.
+
+    Raises:
+        ValueError: If there is none, or this version lacks a class that the configuration names.
+    """
+    task, character = cfg.task.name, cfg.character.name
+    if module := cfg.character.get("module"):
+        _import(module, character)
+    if cfg.stage.name not in cfg.task:
+        raise ValueError(
+            f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
+            f"task={task} with stage=transfer and pretrained=<folder of the pre-training>, or pretrained=builtin"
+        )
+    # Import everything that is named: importing a user's motions may register the user's character.
+    names = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
+    environment, *_ = [pkgutil.resolve_name(name) for name in names]
+    able: tuple[str, ...] = getattr(environment, "characters", tuple)()
+    if able and character not in able:
+        known = " or ".join(able)
+        raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+
+
+def require_files(cfg: DictConfig, task: DictConfig) -> None:
+    """Check that the files of a task's environments exist.
+
+    Args:
+        cfg: Configuration of the run.
+        task: Configuration of the environments.
+
+    Raises:
+        ValueError: If one is missing, with the settings that give a new place.
+    """
+    files = places.settings(OmegaConf.to_container(task, resolve=True))
+    lost = {value: name for name, value in files if not Path(value).exists()}
+    if not lost:
+        return
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    named = {value: name for name, value in places.outside(config).items()}
+    value, argument = next(iter(lost.items()))
+    name = named.get(value, f"task.{cfg.stage.name}.{argument}")
+    raise ValueError(
+        f"{name}={value} does not exist: put it back, or give its new place by {name}=PATH, with resume= by "
+        f"+{name}=PATH, and to torchrl-mcp-play and torchrl-mcp-evaluate by --task {argument}=PATH"
+    )
+
+
+def require_equipment(cfg: DictConfig) -> None:
+    """Check that this machine has the configured device and logger.
+
+    Raises:
+        ValueError: If one is missing.
+    """
+    try:
+        kind_of_device = torch.device(cfg.device).type
+    except RuntimeError as error:
+        raise ValueError(f"torch does not know device={cfg.device}: pass cpu or cuda") from error
+    if kind_of_device == "mps":
+        raise ValueError(f"device={cfg.device} has no float64, which normalisers count in: pass cpu or cuda")
+    if kind_of_device == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
+            "build of torch on a machine with a GPU"
+        )
+    if cfg.physics.on_device and "num_workers" in cfg.collector:
+        raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
+    kind = cfg.logger.logger_type if cfg.logger else "csv"
+    if kind != "csv" and find_spec(kind) is None:
+        raise ValueError(f"logger={kind} needs {kind}: pip install 'torchrl-mcp[{kind}]', or choose logger=tensorboard")
+
+
+def require_known(config: Mapping[str, Any], source: Path) -> None:
+    """Check that all classes and functions in a run's configuration exist and may be called.
+
+    Args:
+        config: The configuration.
+        source: The file of the configuration.
+
+    Raises:
+        ValueError: If one is missing or not trusted.
+    """
+    names = list(targets(config))
+    # Importing the library's own modules runs no other code, so it is safe before the check of trust.
+    if lost := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
+        raise ValueError(
+            f"{source} is of another version of torchrl-mcp: this version has no {lost[0]}. "
+            "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
+        )
+    require_trusted(config, source)
+    if lost := [name for name in names if not _exists(name)]:
+        raise ValueError(
+            f"{source} names {lost[0]}, which Python does not find: if the module is yours, run the command in its "
+            "folder, or add its folder to PYTHONPATH"
+        )
+
+
+def require_arguments(name: str, given: Collection[str]) -> None:
+    """Check that a task takes arguments.
+
+    Args:
+        name: Name of the task's class, or of another function, which is not checked.
+        given: Names of the arguments.
+
+    Raises:
+        ValueError: If it does not, with those that it takes.
+    """
+    if not inspect.isclass(pkgutil.resolve_name(name)):
+        return
+    taken = arguments(name)
+    if unknown := [argument for argument in given if argument not in taken]:
+        tasks_own = {*inspect.signature(CharacterEnv.__init__).parameters} - {"max_episode_steps"}
+        listed = sorted({*taken} - tasks_own - {"kwargs", "character"})
+        raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
+
+
+def arguments(name: str) -> dict[str, inspect.Parameter]:
+    """Return the parameters of a class or function by its name, with those that a class passes on to its bases."""
+    made = pkgutil.resolve_name(name)
+    kinds = made.__mro__ if inspect.isclass(made) else ()
+    found: dict[str, inspect.Parameter] = {}
+    for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
+        parameters = inspect.signature(maker).parameters
+        found = {**parameters, **found}
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+            break
+    return found
+
+
+def _import(module: str, character: str) -> None:
+    """Import the module that adds a character to the library's."""
+    try:
+        import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        raise ValueError(
+            f"character={character} is in the module {module}, which Python does not find: call from the folder of "
+            f"{module}.py, or add that to PYTHONPATH"
+        ) from error
+
+
+def _exists(name: str) -> bool:
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    return True
