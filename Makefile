@@ -5,6 +5,7 @@ STAMP := .venv/.installed
 TREE := build/tree
 LATEST := build/latest
 # One torch thread per worker: two workers with a thread pool each would fight over two cores.
+# All tests of a file run in one worker, which makes the file's fixtures once.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
 
 .DEFAULT_GOAL := help
@@ -38,10 +39,10 @@ demo: $(STAMP)
 	$(BIN)/torchrl-mcp-demo
 
 test: $(STAMP)
-	$(PYTEST) -n 2 -m "not slow"
+	$(PYTEST) -n 2 --dist loadfile -m "not slow"
 
 test-slow: $(STAMP)
-	$(PYTEST) -n 2 -m slow
+	$(PYTEST) -n 2 --dist loadfile -m slow
 
 # An environment of its own, without the pins.
 test-latest:
@@ -49,7 +50,7 @@ test-latest:
 	$(LATEST)/bin/python -m pip install --quiet torch setuptools wheel
 	$(LATEST)/bin/python -m pip install --quiet --no-build-isolation -e '.[dev,warp]'
 	$(LATEST)/bin/python -m pip freeze --exclude-editable
-	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 -m "not slow"
+	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 --dist loadfile -m "not slow"
 
 # mypy and doctest read folders, not import hooks, and so cannot see that envs/ is torchrl_mcp.envs.
 # They get a tree of links in which it is. Doctests leave out what imports an extra that need not be there.

@@ -1,6 +1,7 @@
 """Which folder may import which, and who may import Hydra."""
 
 import ast
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -154,14 +155,21 @@ def imports_of_mujoco():
     return [name for name in using if f"torchrl_mcp.{folder(name)}" not in guarded] + [firsts[name] for name in guarded]
 
 
-@pytest.mark.parametrize("name", sorted(imports_of_mujoco()))
-def test_tensordict_and_with_it_triton_is_imported_before_mujoco(name):
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks a process that has imported torch")
+def test_tensordict_and_with_it_triton_is_imported_before_mujoco():
     code = (
-        "import importlib, sys\n"
-        "importlib.import_module(sys.argv[1])\n"
-        "print(*[name for name in sys.modules if name in ('triton', 'tensordict', 'mujoco')])"
+        "import importlib, os, sys, torch\n"
+        "class Watch:\n"
+        "    def find_spec(name, *_):\n"
+        "        if name == 'mujoco':\n"
+        "            print(module, 'tensordict' in sys.modules, flush=True)\n"
+        "            os._exit(0)\n"
+        "sys.meta_path.insert(0, Watch)\n"
+        "for module in sys.argv[1:]:\n"
+        "    if not os.fork():\n"
+        "        importlib.import_module(module)\n"
+        "    os.wait()"
     )
-    run = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, check=True)
-    loaded = run.stdout.split()
-    assert loaded[-1] == "mujoco"
-    assert "tensordict" in loaded
+    names = imports_of_mujoco()
+    run = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
+    assert dict(map(str.split, run.stdout.splitlines())) == dict.fromkeys(names, "True")

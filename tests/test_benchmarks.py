@@ -84,6 +84,7 @@ def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(tmp_path):
         assert int(row["refused"]) + int(row["harmless"]) == int(row["flips"]) == 20
 
 
+@pytest.mark.slow
 def test_the_soak_acts_unfitly_in_every_task_and_all_that_comes_of_it_is_an_end_of_the_episode(tmp_path):
     rows = run("soak.py", tmp_path / "out.csv", "steps")
     assert len({(row["task"], row["character"]) for row in rows}) == 13

@@ -23,6 +23,7 @@ PROGRAMS = {
 SMALLER = {
     "torchrl-mcp-train": "preset=smoke logger=none num_threads=1 torch_threads=1 progress_bar=false "
     "training.total_frames=128 training.num_epochs=2 task.pretrain.max_episode_steps=20 evaluation.episodes=4 "
+    "task.evaluation.max_episode_steps=20 "
     "hydra/job_logging=none hydra/hydra_logging=none",
     "torchrl-mcp-evaluate": "--episodes 4 --output evaluation.json",
     "torchrl-mcp-figures exploration": "--trajectories 2 --seconds 0.3",

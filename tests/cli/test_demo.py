@@ -1,4 +1,4 @@
-"""The demonstration as a whole, with the smallest budget: killed, called again, finished."""
+"""The demonstration as a whole, with the smallest budget: interrupted, called again, finished."""
 
 import csv
 import json
@@ -21,36 +21,77 @@ from torchrl_mcp.cli import demo as command
 from torchrl_mcp.commands import demo
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.training.trainer import Trainer
 
 FILES = ["index.html", "results.md", "results.json", *(f"learning_curves.{suffix}" for suffix in ("png", "svg", "csv"))]
 SMOKE = {"preset": "demo_smoke"}
+HALF = 256
+"""Environment steps of half of the smallest budget."""
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A demonstration that was killed in the middle and called again."""
-    folder = tmp_path_factory.mktemp("runs") / "my demo"
+class Interruption(Exception):
+    """The demonstration is cut off."""
+
+
+def interrupt(folder):
+    """Leave the gate half trained."""
+    save = Trainer.save
+
+    def save_and_stop(trainer):
+        save(trainer)
+        if trainer.progress.frames == HALF:
+            raise Interruption
+
+    gate = demo.configure(folder, [], pretrain=False, **SMOKE)["mcp"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "save", save_and_stop)
+        with pytest.raises(Interruption):
+            demo.learn([gate])
+
+
+def kill(folder):
+    """The same by a signal to the command."""
     command = [sys.executable, "-m", "torchrl_mcp.cli.demo", "--smoke", "--output", folder]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
-    while not list(folder.glob("mcp/checkpoints/checkpoint-*256.torchrl")):
+    while not list(folder.glob(f"mcp/checkpoints/checkpoint-*{HALF}.torchrl")):
         assert killed.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
     killed.kill()
     killed.wait()
+
+
+def go_on(folder, stop):
+    """Run the demonstration after it was stopped in the middle."""
+    stop(folder)
     half = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     with redirect_stdout(StringIO()) as output:
         demo.run(folder, [], **SMOKE)
     return SimpleNamespace(folder=folder, half=half, output=output.getvalue())
 
 
-def test_called_again_it_goes_on_where_it_was_killed(finished):
-    assert "mcp/checkpoints/checkpoint-000000000256.torchrl" in finished.half
-    assert not finished.half & {*FILES, "mcp/evaluation.json"}
+def require_continued(demonstration):
+    assert f"mcp/checkpoints/checkpoint-000000000{HALF}.torchrl" in demonstration.half
+    assert not demonstration.half & {*FILES, "mcp/evaluation.json"}
     for name in ("mcp", "scratch"):
-        with (finished.folder / name / "metrics.csv").open(newline="") as file:
+        with (demonstration.folder / name / "metrics.csv").open(newline="") as file:
             assert [int(row["iteration"]) for row in csv.DictReader(file)] == [1, 2, 3, 4]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A demonstration that was interrupted in the middle and called again."""
+    return go_on(tmp_path_factory.mktemp("runs") / "my demo", interrupt)
+
+
+def test_called_again_it_goes_on_where_it_was_interrupted(finished):
+    require_continued(finished)
+
+
+@pytest.mark.slow
+def test_called_again_it_goes_on_where_it_was_killed(tmp_path):
+    require_continued(go_on(tmp_path / "my demo", kill))
 
 
 def test_everything_promised_is_in_one_folder(finished):

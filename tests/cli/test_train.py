@@ -29,7 +29,7 @@ def rounds():
         yield [f"{name}={found[number]}" for name, found in groups.items() if number < len(found)]
 
 
-@pytest.mark.parametrize("choices", rounds(), ids=" ".join)
+@pytest.mark.parametrize("choices", list(rounds()), ids=" ".join)
 def test_every_choice_of_every_group_composes(choices):
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         compose("train", choices)

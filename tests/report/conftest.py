@@ -1,11 +1,16 @@
 import csv
 import json
+import tarfile
 from functools import partial
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
 
+from torchrl_mcp.report.results import find_runs
+
+TABLE_2 = Path(__file__).parents[2] / "benchmarks/results/table2"
 MACHINE = {"processor": "Abacus", "cores": 2, "device": "cpu", "python": "3.11", "torch": "2.13", "mujoco": "3.17"}
 
 
@@ -91,6 +96,17 @@ def write_run(run_writers, tmp_path):
 @pytest.fixture
 def write_mcp(run_writers, tmp_path):
     return run_writers(tmp_path / "runs")[1]
+
+
+@pytest.fixture(scope="session")
+def published(tmp_path_factory):
+    """The published runs of Table 2: their folder, and what is read from it."""
+    folder = tmp_path_factory.mktemp("published")
+    with tarfile.open(TABLE_2 / "runs.tar.xz") as packed:
+        packed.extractall(folder, filter="data")
+    runs, damaged = find_runs([folder])
+    assert not damaged
+    return folder, runs
 
 
 @pytest.fixture(scope="session")

@@ -49,7 +49,7 @@ def jobs_of(*arguments):
 
 
 def smoke(root, *arguments):
-    benchmark.main(["benchmark=smoke", f"run_root={root}", *arguments])
+    benchmark.main(["benchmark=smoke", f"run_root={root}", "task.evaluation.max_episode_steps=20", *arguments])
 
 
 @pytest.fixture(scope="module")

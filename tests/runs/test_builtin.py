@@ -51,7 +51,7 @@ def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16
 
 
 def test_the_values_that_choose_options_are_published_and_needed(tmp_path):
-    run = experiment.train(configure(tmp_path / "run", "method=option_critic", *BIPED[1:]))
+    run = experiment.train(configure(tmp_path / "run", "method=option_critic", *BIPED[1:], "training.total_frames=128"))
     policies.publish_run(run, tmp_path / "with.torchrl")
     _, agent, _ = policies.restore(tmp_path / "with.torchrl", num_envs=1, seed=0)
     cfg, original, _ = policies.restore(run, num_envs=1, seed=0)

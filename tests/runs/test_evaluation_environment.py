@@ -1,5 +1,7 @@
 """Evaluations are alike, whatever was used in training."""
 
+from functools import cache
+
 import pytest
 import torch
 from hydra import compose, initialize_config_module
@@ -93,6 +95,12 @@ def configure(task, *overrides):
         return compose("train", [f"task={task}", f"stage={STAGES[task]}", "num_threads=1", *overrides])
 
 
+@cache
+def usual(task):
+    """The configuration of a task, which nobody changes."""
+    return configure(task)
+
+
 def evaluated_as(cfg):
     """Arguments of the evaluation's environment."""
     return OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
@@ -110,7 +118,7 @@ def trained_otherwise(task):
 
 @every_task
 def test_an_evaluation_says_every_setting_of_its_environment(task):
-    cfg = configure(task)
+    cfg = usual(task)
     arguments = requirements.arguments(cfg.task[STAGES[task]]._target_)
     inside = {
         "furnish",
@@ -128,10 +136,10 @@ def test_an_evaluation_says_every_setting_of_its_environment(task):
 
 @every_task
 def test_evaluations_are_equal_whatever_was_used_in_training(task):
-    usual, other = configure(task), trained_otherwise(task)
-    assert evaluated_as(usual) == evaluated_as(other)
+    plain, other = usual(task), trained_otherwise(task)
+    assert evaluated_as(plain) == evaluated_as(other)
     outcomes = []
-    for cfg in (usual, other):
+    for cfg in (plain, other):
         env = build.make_env(cfg, num_envs=3, seed=0, **{**evaluated_as(cfg), "max_episode_steps": 20})
         outcomes.append(evaluate(Push(env), env))
     one, two = outcomes
@@ -162,7 +170,7 @@ def test_near_objects_of_training_are_clear_of_every_character(task, character):
 @pytest.mark.parametrize("task", ["heading", "location", "carry", "dribble"])
 def test_every_curriculum_makes_environments_that_begin_and_are_evaluated_alike(task, curriculum):
     cfg = configure(task, f"curriculum={curriculum}")
-    assert evaluated_as(cfg) == evaluated_as(configure(task))
+    assert evaluated_as(cfg) == evaluated_as(usual(task))
     env = build.make_env(cfg, num_envs=2, seed=0, max_episode_steps=3)
     another = curriculum == "mixed" and task in ("carry", "dribble")
     assert ("task_reward" in env.rollout(2)["next"]) == another

@@ -19,6 +19,7 @@ from torchrl_mcp.runs import benchmark, build, experiment, policies, records
 from torchrl_mcp.training.checkpoint import run_checkpoint
 
 FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
+LENGTHS = ["task.evaluation.max_episode_steps=40", "task.pretrain.max_episode_steps=30"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
 
 
@@ -34,8 +35,9 @@ def contents(folder):
 @pytest.fixture(scope="module")
 def run(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    assert command("train", *FAST, "task.pretrain.max_episode_steps=100", cwd=folder).returncode == 0
-    return folder / "runs/holdout-ant/pretrain/mcp/preset-smoke_task.pretrain.max_episode_steps-100/seed0"
+    assert command("train", *FAST, *LENGTHS, cwd=folder).returncode == 0
+    name = "_".join(["preset-smoke", *LENGTHS]).replace("=", "-")
+    return folder / f"runs/holdout-ant/pretrain/mcp/{name}/seed0"
 
 
 def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run):
@@ -44,7 +46,7 @@ def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run)
     assert {path.name for path in run.iterdir()} == {"config.yaml", "origin.json", "metrics.csv", "checkpoints"}
     assert OmegaConf.load(run / "config.yaml").method.name == "mcp"
     origin = json.loads((run / "origin.json").read_text())
-    assert origin["command"] == ["torchrl-mcp-train", *FAST, "task.pretrain.max_episode_steps=100"]
+    assert origin["command"] == ["torchrl-mcp-train", *FAST, *LENGTHS]
     assert origin["choices"]["preset"] == "smoke"
     assert "hydra/launcher" not in origin["choices"]
 
@@ -62,8 +64,8 @@ def test_evaluation_reports_as_many_episodes_as_asked_and_writes_them_down(comma
     for mode in ("deterministic", "stochastic"):
         assert numbers[mode]["episodes"] == 20
         assert f"normalised return {numbers[mode]['normalised_return']:.3f}" in outcome.stdout
-        # Holdout normalises by 6 per step, evaluated over 200 steps, though this run was trained on 100.
-        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / (6 * 200), rel=1e-4)
+        # Holdout normalises by 6 per step, evaluated over 40 steps, though this run was trained on 30.
+        assert numbers[mode]["normalised_return"] == pytest.approx(numbers[mode]["return"] / (6 * 40), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -95,8 +97,8 @@ def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arg
 
 def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(command, run):
     before = contents(run)
-    same = command("train", *FAST, "task.pretrain.max_episode_steps=100", f"run_dir={run}", cwd=run.parents[5])
-    other = command("train", *FAST, f"run_dir={run}", cwd=run.parents[5])
+    same = command("train", *FAST, *LENGTHS, f"run_dir={run}", cwd=run.parents[5])
+    other = command("train", *FAST, LENGTHS[0], f"run_dir={run}", cwd=run.parents[5])
     assert same.returncode != 0 != other.returncode
     assert f"continue it with torchrl-mcp-train resume={run}" in same.stderr
     assert "holds a run that differs in task: give another run_dir" in other.stderr
@@ -187,7 +189,7 @@ def test_training_ends_with_an_evaluation_also_after_a_resume(evaluated):
     assert records.is_complete(evaluated)
     written = json.loads((evaluated / "evaluation.json").read_text())
     assert (written["episodes"], written["seed"]) == (3, 12345)
-    assert written["environment"]["max_episode_steps"] == 200  # of the task, where training had 100
+    assert written["environment"]["max_episode_steps"] == 40  # of the task, where training had 30
     for mode in ("deterministic", "stochastic"):
         assert written[mode]["episodes"] == 3
         assert "gates/entropy" in written[mode]["diagnostics"]

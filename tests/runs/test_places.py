@@ -99,7 +99,7 @@ def test_motions_are_found_from_every_folder_and_missed_by_the_name_of_their_set
     assert command(*evaluation, cwd=tmp_path / "a").returncode == 0
 
 
-@pytest.mark.parametrize("name", NASTY)
+@pytest.mark.parametrize("name", ["a=b[1]", "größe, it's two words", "{x}$HOME"])
 def test_what_is_printed_runs_in_a_folder_of_any_name(root, command, name):
     folder = (root / "a/run").rename(root / name)
     refusal = command("train", *SHORT, "logger=none", quoting.setting("run_dir", name), cwd=root)
