@@ -1,13 +1,16 @@
 r"""Search of settings at equal processor time: every trial trains for the same CPU seconds on one core.
 
     python benchmarks/search.py heading mcp pretrained=builtin stage=transfer --seconds 90 --trials 14
+    python benchmarks/search.py heading mcp pretrained=builtin stage=transfer --seconds 120 --seeds 100 101 \
+        --candidate large="training.num_envs=128 training.frames_per_batch=4096" --candidate small=
 
 Optuna's TPE sampler proposes settings, each of them an argument of ``torchrl-mcp-train``. A trial is stopped by its CPU
 seconds, counted from the first step on, so that other work on the machine does not falsify the comparison. Its score is
 the mean of two returns: the median in training over the last fifth of the time, and 64 deterministic episodes of the
 printed task. Trials with a training return below the median of the others at half the time are given up. Repeated, the
-command goes on with the trials that are missing. Optuna 4 or newer does not go with Hydra's plugin: install it in an
-environment of its own.
+command goes on with the trials that are missing. With candidates, it compares these alone, one run per seed.
+
+Optuna 4 or newer does not go with Hydra's plugin: install it in an environment of its own.
 """
 
 import argparse
@@ -140,11 +143,17 @@ def main() -> None:
     parser.add_argument("settings", nargs="*", help="of all trials")
     parser.add_argument("--seconds", type=float, required=True, help="CPU seconds of a trial")
     parser.add_argument("--trials", type=int, default=24)
+    parser.add_argument("--candidate", action="append", default=[], metavar="NAME=SETTINGS", help="instead of a search")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[SEED], help="of candidates")
     parser.add_argument("--root", type=Path, default=Path("runs/search"))
     arguments = parser.parse_args()
     root = arguments.root / f"{arguments.task}-{arguments.method}"
     root.mkdir(parents=True, exist_ok=True)
-    fixed = [f"task={arguments.task}", f"method={arguments.method}", f"seed={SEED}", *arguments.settings]
+    fixed = [f"task={arguments.task}", f"method={arguments.method}", *arguments.settings]
+    if arguments.candidate:
+        compare(root, fixed, dict(one.split("=", 1) for one in arguments.candidate), arguments.seeds, arguments.seconds)
+        return
+    fixed.append(f"seed={SEED}")
 
     def objective(trial: optuna.Trial) -> float:
         folder = root / f"trial-{trial.number:03}"
@@ -171,10 +180,28 @@ def main() -> None:
     write(study, root.with_suffix(".csv"))
 
 
+def compare(root: Path, fixed: list[str], candidates: dict[str, str], seeds: list[int], seconds: float) -> None:
+    """Train and evaluate candidates with every seed, and write a row for each."""
+    table = []
+    for seed in seeds:
+        for name, settings in candidates.items():
+            folder = root / f"{name}-seed{seed}"
+            if not (found := folder / "score.json").exists():
+                numbers = score(folder, seconds, [*fixed, f"seed={seed}", "checkpoint_interval=4", *settings.split()])
+                found.write_text(json.dumps(numbers))
+            table.append({"candidate": name, "seed": seed, **json.loads(found.read_text()), "settings": settings})
+            write_rows(table, root.with_suffix(".csv"))
+
+
 def write(study: optuna.Study, path: Path) -> None:
     """Write the trials, best first."""
     found = sorted(study.trials, key=lambda trial: -1 if trial.value is None else trial.value, reverse=True)
     table = [{"trial": t.number, "state": t.state.name, "score": t.value, **t.user_attrs, **t.params} for t in found]
+    write_rows(table, path)
+
+
+def write_rows(table: list[dict], path: Path) -> None:
+    """Write a table as CSV."""
     names = list(dict.fromkeys(name for row in table for name in row))
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names)

@@ -166,6 +166,9 @@ def test_every_gate_that_comes_with_the_library_has_a_card_and_does_its_task(gat
         numbers = played(gate, num_envs=4, max_episode_steps=120)
         assert numbers["terminated"] == 0.0
         assert numbers["reach"]["place"] > 0.5
+    elif "location" in gate.stem:
+        near = {"target_distances": (1.0, 2.0), "target_intervals": (20.0, 20.0), "max_episode_steps": 240}
+        assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > 0.8
     else:
         near = {"object_distances": (1.0, 2.0), "target_distances": (1.0, 2.0), "max_episode_steps": 450}
         assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > 0.1

@@ -11,7 +11,7 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs import experiment, records
 from torchrl_mcp.training import checkpoint, precision
 
 X86 = {"architecture": "x86_64", "avx512_bf16": False, "amx_bf16": False}
@@ -113,7 +113,7 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
     monkeypatch.setattr(
         torch, "autocast", lambda *a, enabled, **k: seen.append(enabled) or autocast(*a, enabled=enabled)
     )
-    monkeypatch.setattr(experiment, "machine", lambda device: {"processor": "Another", "device": device})
+    monkeypatch.setattr(records, "machine", lambda device: {"processor": "Another", "device": device})
     processor(ratio=5.0, amx_bf16=not chosen)
     with pytest.warns(UserWarning, match=r"5\.0 times as long") if chosen else nullcontext():
         experiment.resume(folder)
