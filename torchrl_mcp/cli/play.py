@@ -14,7 +14,7 @@ PROGRAM = "torchrl-mcp-play"
 EXAMPLES = f"""\
 examples:
   {PROGRAM} builtin:humanoid                              # a film of the networks that come with the library
-  {PROGRAM} builtin:humanoid-heading --viewer web         # steer in a browser: arrow keys, gates, pushes
+  {PROGRAM} builtin:humanoid-location --viewer web        # steer in a browser: clicks, gates, pushes
   {PROGRAM} runs/my-run --output walk.mp4 --seconds 20 --width 1280 --height 720
   {PROGRAM} --watch runs/my-run --viewer web              # a run in training: loads each new checkpoint
   {PROGRAM} --agent random task=carry character=humanoid  # look at an environment before training
