@@ -103,6 +103,20 @@ def test_a_gate_that_began_as_another_gate_leaves_out_the_same_parts(run, tmp_pa
     torch.testing.assert_close(act(gate), act(tmp_path / "next"), atol=0.02, rtol=0)
 
 
+def test_training_begins_with_a_built_in_gate_and_the_primitives_under_it(tmp_path):
+    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={tmp_path}"]
+    settings += ["method=mcp", "task=location", "character=biped", "stage=transfer", "pretrained=builtin:biped-heading"]
+    settings += ["transfer.keep=[primitives,observation_normaliser,gating]", "width=0.5"]
+    settings += ["transfer.freeze=[primitives,observation_normaliser,gating]", "training.total_frames=128"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        experiment.train(compose("train", settings))
+    _, trained, _ = policies.restore(tmp_path, num_envs=1, seed=0)
+    _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "heading"), num_envs=1, seed=0)
+    for part in ("primitives", "observation_normaliser", "gating"):
+        for name, value in gate.parts[part].state_dict().items():
+            assert torch.equal(trained.parts[part].state_dict()[name], value)
+
+
 def test_a_gate_has_a_name_that_commands_take(library, monkeypatch, capsys):
     path = builtin.locate("builtin:biped-heading")
     assert path == builtin.builtin("mcp", "biped", "heading") == library / "mcp-biped-heading.torchrl"

@@ -20,6 +20,8 @@ from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
+from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.publish import load_kept
 from torchrl_mcp.runs.requirements import require_arguments, require_environment, require_files
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
@@ -103,7 +105,7 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     if cfg.stage.name == "transfer":
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
         if pretrained is not None and cfg.transfer.keep:
-            checkpoint.load_parts(parts, cfg.transfer.keep, pretrained)
+            load_kept(parts, cfg.transfer.keep, pretrained, partial(builtin, cfg.method.name, cfg.character.name))
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze

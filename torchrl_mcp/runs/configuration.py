@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mcp.runs import places, validation
-from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.builtin import PREFIX, builtin, locate
 from torchrl_mcp.training import checkpoint
 
 
@@ -76,6 +76,8 @@ def initial_networks(cfg: DictConfig) -> Path | None:
         return None
     if cfg.pretrained == places.BUILTIN:
         return builtin(cfg.method.name, cfg.character.name)
+    if cfg.pretrained.startswith(PREFIX):
+        return locate(cfg.pretrained)
     return checkpoint.find(Path(cfg.pretrained))
 
 

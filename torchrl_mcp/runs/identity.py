@@ -84,7 +84,7 @@ def folder_name(overrides: str, pretrained: str | None) -> str:
     >>> folder_name("preset-smoke", None)
     'preset-smoke'
     """
-    if pretrained not in (None, BUILTIN):
+    if pretrained is not None and pretrained != BUILTIN:
         path = Path(pretrained)
         mark = digest(path) if path.exists() else _hash(pretrained)
         overrides = "_".join(filter(None, (overrides, f"pretrained-{mark}")))

@@ -24,7 +24,7 @@ NAMES = (PRETRAINED, "path")
 """Names of settings whose value is a file or folder outside the run folder, in any group."""
 
 BUILTIN = "builtin"
-"""Value of ``pretrained`` for the networks that come with the library."""
+"""Value of ``pretrained``, or its beginning, for the networks that come with the library."""
 
 
 def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -40,7 +40,7 @@ def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
         for key, value in config.items():
             if not isinstance(value, str):
                 yield from settings(value, f"{prefix}{key}.")
-            elif key in NAMES and value != BUILTIN and config.get("_target_") != GET_CLASS:
+            elif key in NAMES and value.partition(":")[0] != BUILTIN and config.get("_target_") != GET_CLASS:
                 yield f"{prefix}{key}", value
 
 

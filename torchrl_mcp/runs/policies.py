@@ -57,8 +57,8 @@ def restore(
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
     agent = make_agent(cfg, env)
-    if checkpoint.shared(file):
-        take_shared(agent.parts, file, builtin(cfg.method.name, cfg.character.name))
+    if shared := checkpoint.shared(file):
+        take_shared(agent.parts, shared, file, builtin(cfg.method.name, cfg.character.name))
     checkpoint.load_agent(agent.parts, file, optional=agent.spare_parts)
     return cfg, agent, env
 

@@ -5,7 +5,7 @@ A gate that was trained over built-in primitives is published without them: the 
 """
 
 import copy
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +59,36 @@ def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> 
     return own
 
 
-def take_shared(parts: nn.ModuleDict, path: Path, origin: Path) -> None:
+def load_kept(parts: nn.ModuleDict, names: Collection[str], path: Path, origin: Callable[[], Path]) -> None:
+    """Restore parts from a checkpoint file, and those of them that it declares as shared from a built-in network.
+
+    Args:
+        parts: Parts of an agent.
+        names: Names of the parts to restore.
+        path: The file.
+        origin: Returns the file of the built-in network.
+
+    Raises:
+        ValueError: If the file does not fit, or its policy was trained over other parts than the built-in network has.
+    """
+    expected = {name: mark for name, mark in checkpoint.shared(path).items() if name in names}
+    checkpoint.load_parts(parts, [name for name in names if name not in expected], path)
+    if expected:
+        take_shared(parts, expected, path, origin())
+
+
+def take_shared(parts: nn.ModuleDict, expected: Mapping[str, str], path: Path, origin: Path) -> None:
     """Restore the parts that a published file omits, from a built-in network.
 
     Args:
         parts: Parts of an agent.
+        expected: Fingerprints of the parts by name.
         path: The published file.
         origin: The file of the built-in network.
 
     Raises:
         ValueError: If the policy was trained over other parts than the built-in network has.
     """
-    expected = checkpoint.shared(path)
     checkpoint.load_parts(parts, expected, origin)
     if differing := [name for name, mark in expected.items() if fingerprint(parts[name]) != mark]:
         raise ValueError(
