@@ -31,7 +31,8 @@ def machine(device: str) -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "device": torch.cuda.get_device_name(device) if on_gpu else device,
         "python": platform.python_version(),
-        **{name: version(name) for name in ("torch", "torchrl", "mujoco")},
+        "torch": str(torch.__version__),  # with the build, which the version of the package leaves out
+        **{name: version(name) for name in ("torchrl", "mujoco")},
     }
 
 
