@@ -30,10 +30,9 @@ def evaluate(folder):
 def test_a_run_ends_with_its_returns_beside_the_papers_and_the_next_commands(folder):
     evaluate(folder)
     lines = summary(folder).splitlines()
-    assert lines[0] == f"run folder: {folder}"
-    assert "128 episodes" in lines[1]
-    assert [line.split()[:2] for line in lines[2:4]] == [["deterministic", "0.750"], ["stochastic", "0.625"]]
-    assert f"paper {TABLE_2['heading', 'biped', 'mcp'].mean:.3f}" in lines[4]
+    assert "128 episodes" in lines[0]
+    assert [line.split()[:2] for line in lines[1:3]] == [["deterministic", "0.750"], ["stochastic", "0.625"]]
+    assert f"paper {TABLE_2['heading', 'biped', 'mcp'].mean:.3f}" in lines[3]
     commands = [line.split() for line in lines[lines.index("next:") + 1 :]]
     assert commands == [[f"torchrl-mcp-{name}", str(folder)] for name in ("play", "evaluate", "report")]
 

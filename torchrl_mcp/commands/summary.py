@@ -15,7 +15,7 @@ from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETUR
 
 def summary(folder: Path) -> str:
     """Return the summary of the run in a folder: returns beside the paper's, and the next commands."""
-    lines = [f"run folder: {folder}", *_returns(folder), "next:"]
+    lines = [*_returns(folder), "next:"]
     trust = trust_options(folder / CONFIG)
     lines += [f"  {quoting.command(name, *trust, folder)}" for name in ("play", "evaluate")]
     lines.append(f"  {quoting.command('report', folder)}")
