@@ -235,7 +235,7 @@ WRONG = {
     "missing bodies": (["import", "stand.txt", "--bodies", "nowhere.yaml"], "nowhere.yaml"),
     "no module": (
         ["import", "stand.txt", "--module", "nowhere"],
-        "--module nowhere is not found: call from the folder",
+        "--module names nowhere, which Python does not find: call from the folder",
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: give it \(--fps\)"),

@@ -32,9 +32,10 @@ def main() -> None:
     try:
         require_files(arguments)
         from torchrl_mcp.commands import motions
+        from torchrl_mcp.runs.requirements import import_own
 
         if arguments.module:
-            motions.add_characters(arguments.module)
+            import_own(arguments.module, "--module names")
         getattr(motions, arguments.run)(arguments)
     except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)

@@ -3,7 +3,6 @@
 import argparse
 import math
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 
 from torch import Tensor
@@ -65,22 +64,6 @@ STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
 
 SLIDING = 0.2
 """Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
-
-
-def add_characters(module: str) -> None:
-    """Import a module that adds characters to the library's.
-
-    Raises:
-        ValueError: If there is no such module.
-    """
-    try:
-        import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
-            raise
-        raise ValueError(
-            f"--module {module} is not found: call from the folder of {module}.py, or add that to PYTHONPATH"
-        ) from error
 
 
 def import_files(arguments: argparse.Namespace) -> None:

@@ -43,7 +43,7 @@ def require_environment(cfg: DictConfig) -> None:
     """
     task, character = cfg.task.name, cfg.character.name
     if module := cfg.character.get("module"):
-        _import(module, character)
+        import_own(module, f"character={character} is in the module")
     if cfg.stage.name not in cfg.task:
         raise ValueError(
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
@@ -163,16 +163,24 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
     return found
 
 
-def _import(module: str, character: str) -> None:
-    """Import the module that adds a character to the library's."""
+def import_own(module: str, origin: str) -> None:
+    """Import a module of the user's, which adds characters to the library's.
+
+    Args:
+        module: Its name.
+        origin: What names it, the beginning of an error.
+
+    Raises:
+        ValueError: If there is no such module.
+    """
     try:
         import_module(module)
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
             raise
         raise ValueError(
-            f"character={character} is in the module {module}, which Python does not find: call from the folder of "
-            f"{module}.py, or add that to PYTHONPATH"
+            f"{origin} {module}, which Python does not find: call from the folder of {module}.py, or add that to "
+            "PYTHONPATH"
         ) from error
 
 
