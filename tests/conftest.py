@@ -32,8 +32,9 @@ settings.load_profile("ci" if os.environ.get("CI") else "default")
 
 
 def pytest_collection_finish():
-    """Let the garbage collector pass over what was imported, which lives to the end."""
+    """Let the garbage collector pass seldom, and over what tests leave alone: imports live to the end."""
     gc.freeze()
+    gc.set_threshold(100_000)
 
 
 @pytest.fixture(scope="session", autouse=True)
