@@ -121,6 +121,21 @@ def test_a_speed_stays_in_the_range_of_the_task_and_changes_no_more():
     assert steering.target_speed == 0.0
 
 
+def test_a_user_who_sets_the_direction_or_the_speed_has_both_in_hand_until_letting_go():
+    for command in (lambda steering: steering.turn(0.5), lambda steering: steering.up()):
+        steering = idle(Heading, speed=(0.0, 1.5), speed_interval=0.03, max_turn=0.15)
+        command(steering)
+        goals = set()
+        for _ in range(5):
+            steering.step()
+            goals.add((round(target(steering), 9), float(steering.player.state["goal"][0, 2])))
+        assert len(goals) == 1
+        steering.let_go()
+        steering.step()
+        now = round(target(steering), 9), float(steering.player.state["goal"][0, 2])
+        assert all(new != old for new, old in zip(now, *goals, strict=True))
+
+
 def test_with_a_goal_of_the_users_an_episode_has_no_time_limit():
     steering = idle(Heading, max_episode_steps=3, terminate_on_fall=False)
     steering.aim(0.0)

@@ -20,8 +20,9 @@ SPEED_STEP = 0.25
 class Steering:
     """A user's control of a playing policy, which viewers call on input from keys, sliders and the mouse.
 
-    Settings persist over episodes, until :meth:`let_go`; with a goal of the user's, episodes have no time limit. A goal
-    or a push takes effect in the next step.
+    Settings persist over episodes, until :meth:`let_go`; with a goal of the user's, episodes have no time limit. Once
+    the user sets the direction or the speed of heading, neither changes at random. A goal or a push takes effect in the
+    next step.
 
     Args:
         player: The player to steer.
@@ -67,9 +68,9 @@ class Steering:
         return float(self.player.env.episode["speed"][0]) if self.speed is None else self.speed
 
     def aim(self, direction: float) -> None:
-        """Set the target direction of heading, in radians from the world's x axis; it no longer wanders."""
-        if isinstance(self.player.env, Heading):
-            self.direction, self.player.env.max_turn = _wrapped(direction), 0.0
+        """Set the target direction of heading, in radians from the world's x axis."""
+        if self.has_direction:
+            self._lead(direction, self.target_speed)
 
     def turn(self, angle: float) -> None:
         """Turn the target direction of heading, to the left by a positive angle in radians."""
@@ -77,10 +78,9 @@ class Steering:
             self.aim(self.target_direction + angle)
 
     def walk(self, speed: float) -> None:
-        """Set the target speed of heading in m/s, within the task's range; it no longer changes."""
-        if isinstance(self.player.env, Heading) and self.has_speed:
-            low, high = self.player.env.speeds
-            self.speed, self.player.env.change_probability = min(max(speed, low), high), 0.0
+        """Set the target speed of heading in m/s, within the task's range."""
+        if self.has_speed:
+            self._lead(self.target_direction, speed)
 
     def accelerate(self, change: float) -> None:
         """Change the target speed of heading, in m/s."""
@@ -104,6 +104,13 @@ class Steering:
         self.walk(0.0)
         if isinstance(self.player.env, Location):
             self.put(self.player.env.com[0, :2].tolist())
+
+    def _lead(self, direction: float, speed: float) -> None:
+        """Set direction and speed of heading, of which neither changes at random any longer."""
+        env = self.player.env
+        if isinstance(env, Heading):
+            self.direction, env.max_turn, env.change_probability = _wrapped(direction), 0.0, 0.0
+            self.speed = min(max(speed, env.speeds[0]), env.speeds[1]) if env.changes_speed else None
 
     def put(self, place: Sequence[float] | np.ndarray) -> None:
         """Place the target of the character, the ball or the box on the ground, x and y in metres."""
