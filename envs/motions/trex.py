@@ -38,7 +38,12 @@ HEIGHT = 0.9
 SWAY: Keyframes = ((0.06, 0.0), (0.31, -0.018), (0.56, 0.0), (0.81, 0.018))
 SURGE: Keyframes = ((0.185, 0.01), (0.435, -0.01), (0.685, 0.01), (0.935, -0.01))
 BOB: Keyframes = ((0.055, -0.012), (0.305, 0.012), (0.555, -0.012), (0.805, 0.012))
-STEP_WIDTH = 0.12
+STEP_WIDTH, STILL_WIDTH = 0.12, 0.3
+"""Distance in metres between the feet in a walk, and in steps on the spot, where a foot does not pass the other."""
+
+FULL_WALK = 0.8
+"""Speed in m/s below which the body surges less, and steps are wider and flatter."""
+
 TOE_AHEAD = 0.19
 """Distance in metres of a foot's tip ahead of the hips in the middle of its stance."""
 
@@ -124,7 +129,7 @@ def trex_walk(speed: float, turn_rate: float) -> MotionClip:
         raise ValueError(f"turn_rate={turn_rate} turns a loop half around: pass less than {torch.pi / duration:.2f}")
     time = torch.arange(round(duration * FPS) + 1, dtype=torch.float64) / FPS
     phase, path = time / STRIDE_TIME, _path(time, speed, turn_rate)
-    place, pelvis = _pelvis(phase, speed * turn_rate / GRAVITY)
+    place, pelvis = _pelvis(phase, speed, turn_rate)
     position, orientation = path.points(place), path.quaternions(pelvis)
     still = about_z(torch.zeros_like(phase))
     joints = {
@@ -147,9 +152,21 @@ def _path(time: Tensor, speed: float, turn_rate: float) -> Placement:
     return Placement(turn, chord.unsqueeze(-1) * torch.stack([(turn / 2).cos(), (turn / 2).sin()], dim=-1))
 
 
-def _pelvis(phase: Tensor, lean: float) -> tuple[Tensor, Tensor]:
-    """Position ``(T, 3)`` and orientation ``(T, 4)`` of the pelvis relative to the path; ``lean`` is to the left."""
-    place = torch.stack([smooth(SURGE, phase), smooth(SWAY, phase), HEIGHT + smooth(BOB, phase)], dim=-1)
+def _walking(speed: float) -> float:
+    """Share of a full walk, from 0 on the spot to 1."""
+    return min(speed / FULL_WALK, 1.0)
+
+
+def _width(speed: float) -> float:
+    """Distance in metres between the feet."""
+    return STILL_WIDTH + _walking(speed) * (STEP_WIDTH - STILL_WIDTH)
+
+
+def _pelvis(phase: Tensor, speed: float, turn_rate: float) -> tuple[Tensor, Tensor]:
+    """Position ``(T, 3)`` and orientation ``(T, 4)`` of the pelvis relative to the path."""
+    surge, sway = _walking(speed) * smooth(SURGE, phase), _width(speed) / STEP_WIDTH * smooth(SWAY, phase)
+    place = torch.stack([surge, sway, HEIGHT + smooth(BOB, phase)], dim=-1)
+    lean = speed * turn_rate / GRAVITY
     return place, multiply(about_z(smooth(PELVIS_YAW, phase)), about_x(smooth(PELVIS_ROLL, phase) - LEAN * lean))
 
 
@@ -188,6 +205,7 @@ def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
     progress = minimum_jerk((own - SWING[0]) / (SWING[1] - SWING[0]))
     ground = _plant(side, start + count + progress, speed, turn_rate)
     pitch, lift, aside = (halting(keyframes, own) for keyframes in (FOOT_PITCH, FOOT_LIFT, FOOT_ASIDE))
+    pitch = pitch * (1 + _walking(speed)) / 2
     orientation = ground.quaternions(about_y(-pitch))
     tip, radius = _tip(side)
     moved = torch.stack([-radius * pitch, aside if side == "left" else -aside, radius + lift], dim=-1)
@@ -201,7 +219,7 @@ def _plant(side: str, touchdown: Tensor, speed: float, turn_rate: float) -> Plac
     In a turn the feet are outside the path of the hips, so that the body balances while leaning inwards.
     """
     path = _path((touchdown + DUTY / 2) * STRIDE_TIME, speed, turn_rate)
-    aside = (STEP_WIDTH / 2 if side == "left" else -STEP_WIDTH / 2) - HEIGHT * speed * turn_rate / GRAVITY
+    aside = (0.5 if side == "left" else -0.5) * _width(speed) - HEIGHT * speed * turn_rate / GRAVITY
     beside = torch.tensor([TOE_AHEAD, aside], dtype=torch.float64).expand(len(touchdown), 2)
     return path.after(Placement(torch.zeros_like(touchdown), beside))
 

@@ -1,6 +1,7 @@
 """Steering in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``."""
 
 import contextlib
+import math
 import shutil
 import threading
 import time
@@ -168,7 +169,7 @@ def test_what_is_done_in_the_browser_reaches_the_player(visit):
     hold(page, "Backspace", lambda: state["time"][0] == 0.0)
 
 
-def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_and_a_stop(visit):
+def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_arrow_keys_and_a_stop(visit):
     _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, curriculum=None)
     player = Show(agent.actor.policy, env)
     page = visit(player)
@@ -185,6 +186,10 @@ def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_
     def away():
         return float(torch.linalg.vector_norm(env.com[0, :2] - place))
 
+    def direction():
+        x, y = (place - env.com[0, :2]).tolist()
+        return math.atan2(y, x)
+
     def speed():
         return float(torch.linalg.vector_norm(env.simulation.state["qvel"][0, :2]))
 
@@ -200,6 +205,9 @@ def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_
     far = away()
     wait(lambda: away() < far - 0.3, page)
     move(page, WIDTH / 2, HEIGHT - 80)
+    hold(page, "ArrowDown", lambda: 1.0 < away() < 1.25)  # at 0.75 m/s, the place leads by 1.125 m
+    seen = direction()
+    hold(page, "ArrowLeft", lambda: abs(math.remainder(direction() - seen, math.tau)) > 0.2)
     hold(page, " ", lambda: away() < 0.3)  # where it is
     wait(lambda: speed() < 0.1, page)
     assert not player.began

@@ -79,6 +79,26 @@ def test_the_humanoid_walks_where_it_is_steered():
         assert math.degrees(math.atan2(way[1], way[0])) == pytest.approx(angle, abs=15.0)
 
 
+def test_the_humanoid_that_goes_to_places_walks_at_the_speed_and_in_the_direction_of_keys_and_stands_after_a_stop():
+    _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, curriculum=None)
+    steering = Steering(Player(agent.actor.policy, env))
+    steering.stop()
+    steering.aim(0.0)
+    for ups, angle, speed in ((2, 0, 0.6), (2, 90, 0.9), (0, 0, 0.0)):  # measured: a quarter more than 0.5, less than 1
+        for _ in range(ups):
+            steering.up()
+        steering.turn(math.radians(angle))
+        steering.stop() if not ups else None
+        places = []
+        for _ in range(150):
+            steering.step()
+            assert not steering.player.began  # no fall
+            places.append(steering.player.data.subtree_com[1, :2].copy())
+        way = (places[-1] - places[-61]) / 2  # in a second
+        assert np.linalg.norm(way) == pytest.approx(speed, abs=0.15 if ups else 0.02)
+        assert not ups or math.degrees(math.atan2(way[1], way[0])) == pytest.approx(angle, abs=15.0)
+
+
 @pytest.mark.parametrize("task", [Carry, Dribble])
 def test_a_target_is_where_it_is_put(task):
     steering = idle(task)
@@ -108,6 +128,29 @@ def test_a_character_is_sent_to_a_place_and_stops_where_it_is():
     assert env.episode["target"][0].tolist() != here
 
 
+def test_a_place_leads_a_character_that_is_steered_until_a_click_or_a_stop():
+    steering = idle(Location, target_intervals=(0.1, 0.1))
+    env = steering.player.env
+    for command, way in (
+        (lambda: steering.aim(math.pi / 2), (0.0, 1.5)),  # at the speed of the task, 1.5 s ahead
+        (lambda: steering.up(-1), (0.0, 1.125)),
+        (lambda: steering.turn(-math.pi / 2), (1.125, 0.0)),
+    ):
+        command()
+        before = env.com[0, :2].clone()
+        steering.step()
+        assert (env.episode["target"][0] - before).tolist() == pytest.approx(way, abs=1e-6)
+    steering.put((3.0, 4.0))
+    steering.step()
+    assert env.episode["target"][0].tolist() == [3.0, 4.0]
+    for _ in range(4):
+        steering.up(-1)
+    here = env.com[0, :2].tolist()
+    for _ in range(3):
+        steering.step()
+        assert env.episode["target"][0].tolist() == pytest.approx(here, abs=1e-6)
+
+
 def test_a_speed_stays_in_the_range_of_the_task_and_changes_no_more():
     steering = idle(Heading, speed=(0.0, 1.5), speed_interval=0.03)
     for change, expected in ((10.0, 1.5), (-0.25, 1.25), (-10.0, 0.0)):
@@ -119,6 +162,21 @@ def test_a_speed_stays_in_the_range_of_the_task_and_changes_no_more():
     assert steering.target_speed == 0.25
     steering.stop()
     assert steering.target_speed == 0.0
+
+
+def test_a_user_who_sets_the_direction_or_the_speed_has_both_in_hand_until_letting_go():
+    for command in (lambda steering: steering.turn(0.5), lambda steering: steering.up()):
+        steering = idle(Heading, speed=(0.0, 1.5), speed_interval=0.03, max_turn=0.15)
+        command(steering)
+        goals = set()
+        for _ in range(5):
+            steering.step()
+            goals.add((round(target(steering), 9), float(steering.player.state["goal"][0, 2])))
+        assert len(goals) == 1
+        steering.let_go()
+        steering.step()
+        now = round(target(steering), 9), float(steering.player.state["goal"][0, 2])
+        assert all(new != old for new, old in zip(now, *goals, strict=True))
 
 
 def test_with_a_goal_of_the_users_an_episode_has_no_time_limit():
@@ -133,16 +191,15 @@ def test_with_a_goal_of_the_users_an_episode_has_no_time_limit():
 
 def test_of_a_task_without_it_nothing_is_turned_or_put():
     steering, ball, walk = idle(Heading), idle(Dribble), idle(Location)
-    assert (walk.has_direction, walk.has_speed, walk.has_place, walk.can_stop) == (False, False, True, True)
+    assert (walk.has_direction, walk.has_speed, walk.has_place, walk.can_stop) == (True, True, True, True)
     assert (steering.has_direction, steering.has_speed, steering.has_place) == (True, False, False)
     assert (ball.has_direction, ball.has_place, ball.can_stop) == (False, True, False)
     steering.put((1.0, 1.0))
     steering.accelerate(1.0)
-    for other in (ball, walk):
-        other.turn(1.0)
-        other.stop()
-        other.step()
-    assert steering.place is steering.speed is ball.direction is ball.place is walk.direction is None
+    ball.turn(1.0)
+    ball.stop()
+    ball.step()
+    assert steering.place is steering.speed is ball.direction is ball.place is None
 
 
 def momentum(player):

@@ -16,19 +16,23 @@ TURN = math.radians(15)
 SPEED_STEP = 0.25
 """Change of the target speed by a key, in m/s."""
 
+LEAD = 1.5
+"""Seconds by which the place leads a character that is steered: at every step of speed it is beyond arrival."""
+
 
 class Steering:
     """A user's control of a playing policy, which viewers call on input from keys, sliders and the mouse.
 
-    Settings persist over episodes, until :meth:`let_go`; with a goal of the user's, episodes have no time limit. A goal
-    or a push takes effect in the next step.
+    Settings persist over episodes, until :meth:`let_go`; with a goal of the user's, episodes have no time limit. Once
+    the user sets the direction or the speed of heading, neither changes at random. In the task location, the place then
+    leads the character, and stays where it is at a speed of 0. A goal or a push takes effect in the next step.
 
     Args:
         player: The player to steer.
 
     Attributes:
-        direction: The user's target direction of heading, in radians from the world's x axis, or None for the task's.
-        speed: The user's target speed of heading, in m/s, or None for the task's.
+        direction: The user's target direction, in radians from the world's x axis, or None for the task's.
+        speed: The user's target speed, in m/s, or None for the task's.
         place: The user's target position of the character or an object, x and y in metres, or None for the task's.
     """
 
@@ -44,12 +48,20 @@ class Steering:
     @property
     def has_direction(self) -> bool:
         """Whether the task has a direction to turn."""
-        return isinstance(self.player.env, Heading)
+        return isinstance(self.player.env, Heading | Location)
 
     @property
     def has_speed(self) -> bool:
         """Whether the task has a speed to change."""
-        return isinstance(self.player.env, Heading) and self.player.env.changes_speed
+        return self._speeds is not None
+
+    @property
+    def _speeds(self) -> tuple[float, float] | None:
+        """Range of the target speed in m/s, None without one."""
+        env = self.player.env
+        if isinstance(env, Location):
+            return 0.0, env.speed
+        return env.speeds if isinstance(env, Heading) and env.changes_speed else None
 
     @property
     def has_place(self) -> bool:
@@ -58,32 +70,37 @@ class Steering:
 
     @property
     def target_direction(self) -> float:
-        """Current target direction of heading, the user's or the task's, in radians from -pi to pi."""
-        return _wrapped(float(self.player.env.episode["direction"][0]) if self.direction is None else self.direction)
+        """Current target direction, the user's, that of heading or else where the character faces, from -pi to pi."""
+        env = self.player.env
+        if self.direction is None:
+            return _wrapped(float(env.heading()[0] if isinstance(env, Location) else env.episode["direction"][0]))
+        return self.direction
 
     @property
     def target_speed(self) -> float:
-        """Current target speed of heading, the user's or the task's, in m/s."""
-        return float(self.player.env.episode["speed"][0]) if self.speed is None else self.speed
+        """Current target speed, the user's or the task's, in m/s."""
+        env = self.player.env
+        if self.speed is None:
+            return env.speed if isinstance(env, Location) else float(env.episode["speed"][0])
+        return self.speed
 
     def aim(self, direction: float) -> None:
-        """Set the target direction of heading, in radians from the world's x axis; it no longer wanders."""
-        if isinstance(self.player.env, Heading):
-            self.direction, self.player.env.max_turn = _wrapped(direction), 0.0
+        """Set the target direction, in radians from the world's x axis."""
+        if self.has_direction:
+            self._lead(direction, self.target_speed)
 
     def turn(self, angle: float) -> None:
-        """Turn the target direction of heading, to the left by a positive angle in radians."""
+        """Turn the target direction, to the left by a positive angle in radians."""
         if self.has_direction:
             self.aim(self.target_direction + angle)
 
     def walk(self, speed: float) -> None:
-        """Set the target speed of heading in m/s, within the task's range; it no longer changes."""
-        if isinstance(self.player.env, Heading) and self.has_speed:
-            low, high = self.player.env.speeds
-            self.speed, self.player.env.change_probability = min(max(speed, low), high), 0.0
+        """Set the target speed in m/s, within the task's range."""
+        if self.has_speed:
+            self._lead(self.target_direction, speed)
 
     def accelerate(self, change: float) -> None:
-        """Change the target speed of heading, in m/s."""
+        """Change the target speed, in m/s."""
         if self.has_speed:
             self.walk(self.target_speed + change)
 
@@ -97,18 +114,27 @@ class Steering:
     @property
     def can_stop(self) -> bool:
         """Whether the character can be told to stand."""
-        return self.has_speed or isinstance(self.player.env, Location)
+        return self.has_speed
 
     def stop(self) -> None:
         """Let the character stand: where it is, or at the lowest of the task's speeds."""
         self.walk(0.0)
-        if isinstance(self.player.env, Location):
-            self.put(self.player.env.com[0, :2].tolist())
+
+    def _lead(self, direction: float, speed: float) -> None:
+        """Set direction and speed; the task changes neither at random any longer."""
+        env, speeds = self.player.env, self._speeds
+        self.direction = _wrapped(direction)
+        self.speed = min(max(speed, speeds[0]), speeds[1]) if speeds else None
+        if isinstance(env, Heading):
+            env.max_turn = env.change_probability = 0.0
+        elif isinstance(env, Location):
+            x, y = env.com[0, :2].tolist()
+            self.place = x, y  # where it stands at a speed of 0
 
     def put(self, place: Sequence[float] | np.ndarray) -> None:
         """Place the target of the character, the ball or the box on the ground, x and y in metres."""
         if self.has_place:
-            self.place = float(place[0]), float(place[1])
+            self.place, self.direction, self.speed = (float(place[0]), float(place[1])), None, None
 
     def pin(self, primitive: int, weight: float) -> None:
         """Hold the gate of a primitive, counted from 0, at a weight."""
@@ -158,9 +184,11 @@ class Steering:
     def step(self) -> None:
         """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
-        held: dict[str, float | tuple[float, float] | None] = {"direction": self.direction, "speed": self.speed}
-        if self.place is not None and isinstance(env, Location):
-            held |= {"target": self.place, "seconds_left": math.inf}
+        held: dict[str, float | Sequence[float] | None] = {}
+        if isinstance(env, Heading):
+            held = {"direction": self.direction, "speed": self.speed}
+        elif self.place is not None and isinstance(env, Location):
+            held = {"target": self._ahead() if self.speed else self.place, "seconds_left": math.inf}
         elif self.place is not None:
             env.simulation.state["mocap_pos"][0, 0, :2] = torch.tensor(self.place)
         for name, value in held.items():
@@ -169,6 +197,12 @@ class Steering:
         if any(goal is not None for goal in (self.direction, self.speed, self.place)):
             env.max_episode_steps = sys.maxsize
         self.player.step()
+
+    def _ahead(self) -> tuple[float, float]:
+        """The place that leads the character in the target direction, x and y in metres."""
+        x, y = self.player.env.com[0, :2].tolist()
+        distance, angle = LEAD * self.target_speed, self.target_direction
+        return x + distance * math.cos(angle), y + distance * math.sin(angle)
 
 
 def _wrapped(angle: float) -> float:
