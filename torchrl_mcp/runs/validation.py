@@ -96,7 +96,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     DISCOUNT: "gamma",
     PROBABILITY: "terminations.initial",
     SHARE: """
-        lmbda discount epsilon momentum initial_states.rest
+        lmbda epsilon momentum initial_states.rest
         initial_states.motions motion_starts
     """,
     FLAG: """

@@ -1,0 +1,84 @@
+"""Where a character should go next: places on the ground, and how it sees them."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchrl_mcp.envs.base import ALL
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
+from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, logarithmic, near
+
+LEAD = 1.0
+"""Seconds of its motion by which a character looks ahead of a ball."""
+
+PUSH = 0.5
+"""Distance in metres to walk behind and beyond a ball, and to the side of it."""
+
+BEHIND = 0.7
+"""Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
+
+
+def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held: Tensor) -> Tensor:
+    """The box, then the place from which the box in hand is just past the target, then where the character stands.
+
+    A gate that has learned to stop within :data:`ARRIVAL_DISTANCE` of a place so brings the box over the target.
+
+    Args:
+        com: Centre of mass of the character, ``(N, 2)``, in metres.
+        box: Position of the box, ``(N, 2)``.
+        target: Position of the target, ``(N, 2)``.
+        taken: Whether the box was taken, ``(N,)``, bool.
+        held: Whether it is held, ``(N,)``, bool.
+
+    Returns:
+        Places, ``(N, 2)``.
+    """
+    way = target - box
+    bringing = com + way + ARRIVAL_DISTANCE * normalize(way, dim=-1)
+    held, done = held.unsqueeze(-1), (taken & ~held).unsqueeze(-1)
+    return torch.where(held, bringing, torch.where(done, com, box))
+
+
+def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor) -> Tensor:
+    """Around the ball until the character is behind it, then through it, then where the character stands.
+
+    The ball is where it will be after :data:`LEAD`. It is left alone where this is at the target.
+
+    Args:
+        com: Centre of mass of the character, ``(N, 2)``, in metres.
+        ball: Position of the ball, ``(N, 2)``.
+        velocity: Velocity of the ball, ``(N, 2)``, in m/s.
+        target: Position of the target, ``(N, 2)``.
+
+    Returns:
+        Places, ``(N, 2)``.
+    """
+    ball = ball + LEAD * velocity
+    onward, approach = normalize(target - ball, dim=-1), normalize(ball - com, dim=-1)
+    left = torch.stack([-onward[:, 1], onward[:, 0]], -1)
+    alignment = (approach * onward).sum(-1, keepdim=True)
+    side = -(approach * left).sum(-1, keepdim=True).sign() * (alignment < 0)  # of the ball, if it is in the way
+    place = ball + PUSH * torch.where(alignment > BEHIND, onward, side * left - onward)
+    return torch.where(near(ball, target, SUCCESS_DISTANCE).unsqueeze(-1), com, place)
+
+
+def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
+    """The goal of :class:`.Location`, in the environment of any task.
+
+    Args:
+        env: The environment.
+        place: Places on the ground, ``(N, 2)``, in metres.
+        ids: Simulations, ``(n,)``.
+
+    Returns:
+        Each place relative to the centre of mass in the character's heading frame, with a logarithmic distance,
+        ``(n, 2)``.
+    """
+    return logarithmic(_turned((place - env.com[:, :2])[ids], -env.heading(ids)))
+
+
+def _turned(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Turn horizontal vectors ``(*B, 2)`` to the left by an angle in radians, ``(*B)``."""
+    (x, y), cos, sin = vectors.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
