@@ -209,9 +209,10 @@ class Carry(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        weights, how = self.curriculum.reward_weights, {"proximity_scale": PROXIMITY_SCALE, "speed": self.speed}
+        weights = self.curriculum.reward_weights
         assert weights is not None
-        return training_reward(*self._motion(), self.success(), weights=weights, **how)
+        where, scale = (*self._motion(), self.success()), PROXIMITY_SCALE
+        return training_reward(*where, weights=weights, proximity_scale=scale, speed=self.speed)
 
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""

@@ -187,9 +187,10 @@ class Dribble(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        weights, how = self.curriculum.reward_weights, {"proximity_scale": PROXIMITY_SCALE, "speed": self.speed}
+        weights = self.curriculum.reward_weights
         assert weights is not None
-        return training_reward(*self._motion(), self.success(), weights=weights, **how)
+        where, scale = (*self._motion(), self.success()), PROXIMITY_SCALE
+        return training_reward(*where, weights=weights, proximity_scale=scale, speed=self.speed)
 
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
