@@ -9,6 +9,9 @@ from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
 from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, logarithmic, near
 
+STRIDE = 1.0
+"""Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
+
 LEAD = 1.0
 """Seconds of its motion by which a character looks ahead of a ball."""
 
@@ -20,9 +23,9 @@ BEHIND = 0.7
 
 
 def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held: Tensor) -> Tensor:
-    """The box, then the place from which the box in hand is just past the target, then where the character stands.
+    """The box, then on the way on which the box in hand comes to the target, then where the character stands.
 
-    A gate that has learned to stop within :data:`ARRIVAL_DISTANCE` of a place so brings the box over the target.
+    The way ends :data:`ARRIVAL_DISTANCE` past the target, because a gate that goes to places stops so much before them.
 
     Args:
         com: Centre of mass of the character, ``(N, 2)``, in metres.
@@ -35,7 +38,8 @@ def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held
         Places, ``(N, 2)``.
     """
     way = target - box
-    bringing = com + way + ARRIVAL_DISTANCE * normalize(way, dim=-1)
+    length = torch.linalg.vector_norm(way, dim=-1, keepdim=True) + ARRIVAL_DISTANCE
+    bringing = com + normalize(way, dim=-1) * length.clamp(max=STRIDE)
     held, done = held.unsqueeze(-1), (taken & ~held).unsqueeze(-1)
     return torch.where(held, bringing, torch.where(done, com, box))
 

@@ -134,7 +134,7 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     settings += ["method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
     settings += [f"transfer.keep=[{known}]", f"transfer.freeze=[{known}]", "training.total_frames=128"]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        experiment.train(compose("train", [*settings, "transfer.goal_entry=waypoint"]))
+        experiment.train(compose("train", [*settings, "waypoint=true", "transfer.goal_entry=waypoint"]))
     _, carry, env = policies.restore(tmp_path, num_envs=20, seed=0)
     _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "location"), num_envs=1, seed=0)
     scene = env.reset()
@@ -143,9 +143,7 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     torch.testing.assert_close(logits, gate_logits(gate.parts, scene["observation"], place))
 
 
-@pytest.mark.parametrize(
-    ("task", "known"), [("carry", "has target.position, .*, waypoint"), ("heading", "is one entry")]
-)
+@pytest.mark.parametrize(("task", "known"), [("carry", "has target.position, "), ("heading", "is one entry")])
 def test_an_entry_that_the_goal_lacks_is_refused(task, known, tmp_path):
     settings = ["preset=smoke", "logger=none", f"run_dir={tmp_path}", "method=mcp", f"task={task}", "character=biped"]
     settings += ["stage=transfer", "pretrained=builtin", "transfer.goal_entry=place"]

@@ -21,15 +21,16 @@ def yes(answer):
 
 
 @pytest.mark.parametrize(
-    ("taken", "held", "expected"),
+    ("taken", "held", "target", "expected"),
     [
-        (False, False, (2.0, 1.0)),  # to the box
-        (True, True, (0.0, 4.3)),  # as far as the box must go, and 0.3 m
-        (True, False, (0.0, 0.0)),  # where the character stands
+        (False, False, (2.0, 5.0), (2.0, 1.0)),  # to the box
+        (True, True, (2.0, 5.0), (0.0, 1.0)),  # a metre of the box's way to the target
+        (True, True, (2.0, 1.4), (0.0, 0.7)),  # the rest of it, and 0.3 m
+        (True, False, (2.0, 1.0), (0.0, 0.0)),  # where the character stands
     ],
 )
-def test_the_way_of_a_carrier_leads_to_the_box_then_past_the_target_and_ends(taken, held, expected):
-    place = carry_waypoint(HERE, at(2.0, 1.0), at(2.0, 5.0), yes(taken), yes(held))
+def test_the_way_of_a_carrier_leads_to_the_box_then_past_the_target_and_ends(taken, held, target, expected):
+    place = carry_waypoint(HERE, at(2.0, 1.0), at(*target), yes(taken), yes(held))
     torch.testing.assert_close(place, at(*expected))
 
 
