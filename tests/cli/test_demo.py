@@ -79,6 +79,10 @@ def require_continued(demonstration):
             assert [int(row["iteration"]) for row in csv.DictReader(file)] == [1, 2, 3, 4]
 
 
+def next_commands(demonstration):
+    return demo.commands(demonstration.folder, demo.configure(demonstration.folder, [], pretrain=False, **SMOKE))
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A demonstration that was interrupted in the middle and called again."""
@@ -107,7 +111,7 @@ def test_the_page_shows_only_what_is_there(finished):
     assert pictures[-1] == "learning_curves.svg"
     assert all((finished.folder / picture).is_file() for picture in pictures)
     assert re.findall(r"<tr><td>(\w+)</td>", page) == ["MCP", "scratch"]
-    assert len(re.findall(r"<pre>torchrl-mcp-", page)) == len(demo.commands(finished.folder))
+    assert len(re.findall(r"<pre>torchrl-mcp-", page)) == len(next_commands(finished))
 
 
 @pytest.mark.parametrize("name", ["mcp", "scratch"])
@@ -137,10 +141,19 @@ def test_both_are_filmed_side_by_side_under_the_same_arrow(finished):
 
 
 def test_its_next_commands_are_commands_of_this_library(finished):
-    for words in map(shlex.split, demo.commands(finished.folder).values()):
+    for words in map(shlex.split, next_commands(finished).values()):
         assert shlex.join(words) in finished.output
         assert words[0] in (Path(sys.executable).parent / words[0]).name
         assert (Path(sys.executable).parent / words[0]).exists()
+
+
+def test_a_curve_begins_after_the_pre_training_of_the_same_demonstration(finished, tmp_path):
+    both = demo.configure(tmp_path, [], pretrain=True, **SMOKE)
+    gate_alone = {name: both[name] for name in ("mcp", "scratch")}
+    later, at_once = (demo.learning_curve(finished.folder, runs, "mcp") for runs in (both, gate_alone))
+    np.testing.assert_allclose(later.frames - at_once.frames, 2 * HALF)
+    np.testing.assert_array_equal(later.mean, at_once.mean)
+    assert list(demo.commands(tmp_path, both)) == ["steer it in the browser"]
 
 
 def test_an_existing_folder_with_other_settings_is_refused(finished):

@@ -9,6 +9,7 @@ import shlex
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -78,13 +79,13 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
         caption=caption(runs, rows),
         film=FILM if filmed else None,
         curves="learning_curves.svg",
-        commands=commands(folder),
+        commands=commands(folder, runs),
     )
     print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes, in {folder}:")
     for name, content in CONTENTS.items():
         if filmed or name != FILM:
             print(f"  {name:35}{content}")
-    print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder).items()), sep="\n")
+    print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder, runs).items()), sep="\n")
 
 
 def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: bool) -> dict[str, DictConfig]:
@@ -201,10 +202,17 @@ def report(folder: Path, runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
     with replacing(folder / "results.md") as partial:
         partial.write_text(table + "\n")
     write_json({"rows": list(rows)}, folder / "results.json")
-    curves = analysis.learning_curves({TITLES[name]: [folder / name] for name in ("mcp", "scratch")}, num_bins=20)
+    curves = [learning_curve(folder, runs, name) for name in ("mcp", "scratch")]
     analysis.write_curves(curves, folder / "learning_curves.csv")
     analysis.save_figure(analysis.draw_curves(curves), folder / "learning_curves")
     return table
+
+
+def learning_curve(folder: Path, runs: Runs, name: str) -> analysis.Curve:
+    """Return the learning curve of a run, which begins after the steps of its pre-training here."""
+    (curve,) = analysis.learning_curves({TITLES[name]: [folder / name]}, num_bins=20)
+    before = _steps(runs["pretrain"]) if name == "mcp" and "pretrain" in runs else 0
+    return replace(curve, frames=curve.frames + before)
 
 
 def caption(runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
@@ -253,11 +261,14 @@ def film(folder: Path, runs: Runs) -> bool:
     return True
 
 
-def commands(folder: Path) -> dict[str, str]:
+def commands(folder: Path, runs: Runs) -> dict[str, str]:
     """Return the next commands by what each does."""
+    steer = {"steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"])}
+    if "pretrain" in runs:
+        return steer
     train = "torchrl-mcp-train method=mcp task=heading character=humanoid stage=transfer pretrained=builtin"
     return {
-        "steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"]),
+        **steer,
         "train a gate yourself": f"{train} run_dir=runs/gate",
         "pre-train the primitives yourself": "torchrl-mcp-demo --pretrain",
     }
