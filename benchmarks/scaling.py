@@ -5,7 +5,12 @@
     python benchmarks/scaling.py --refit    # seconds, from existing measurements
 
 It measures whole iterations of MCP on the humanoid's heading task with the built-in primitives, in the precision that
-``autocast=auto`` chooses. From the seconds of their sections it fits the constants of a model:
+``autocast=auto`` chooses, with one thread, two, and one for every core. What the last reach is printed beside what the
+first two predict: that checks the prediction on this machine. ``*_cpu`` are CPU seconds of all threads: a section in
+which two threads take as long as one, with as much CPU, is serial; one that takes half the time scales; in between,
+threads wait for each other or for Python's lock. ``serial`` is that share by Amdahl's law.
+
+From the seconds of the sections it fits the constants of a model:
 
     iteration = T * (physics * N / speed-up + forward + forward' * N + rest + rest' * N) + update * N * T / speed-up
 
@@ -17,8 +22,11 @@ counted here, or the time of their arithmetic if longer, plus the transfers. ``G
 
 import argparse
 import csv
+import os
+import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -40,10 +48,12 @@ SECTIONS = ("physics", "forward", "collection", "update", "other")
 GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
 """Assumptions: launches of operations from Python, sustained arithmetic, and a small transfer with synchronisation."""
 MEASURED = ("num_envs", "threads", "workers", "samples_per_second", *(f"{name}_seconds" for name in SECTIONS))
+CPU = tuple(f"{name}_cpu" for name in SECTIONS)
+CORES = os.cpu_count() or 1
 TRANSFERS = 5
 """Transfers of a control step, as tests/accelerator counts them for this task."""
-MACHINES = {"2 cores": (2, False), "8 cores": (8, False), "64 cores": (64, False), "8 cores, GPU": (8, True),
-            "64 cores, GPU": (64, True)}  # fmt: skip
+MACHINES = {f"{cores} cores": (cores, False) for cores in sorted({2, 8, 16, 64, CORES})}
+MACHINES |= {f"{cores} cores, GPU": (cores, True) for cores in (8, 64)}
 
 
 class Operations(TorchDispatchMode):
@@ -98,6 +108,14 @@ class Record:
 
 
 def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
+    """Return samples per second and the seconds of an iteration's sections, by the wall and of all threads' CPU."""
+    row = sections(num_envs, threads, workers)
+    with patch("time.perf_counter", time.process_time):
+        again = sections(num_envs, threads, workers)
+    return row | {f"{name}_cpu": again[f"{name}_seconds"] for name in SECTIONS}
+
+
+def sections(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
     """Return samples per second and the seconds of an iteration's sections, without the first iteration."""
     torch.set_num_threads(threads)
     trainer = make_trainer(num_envs, threads, workers)
@@ -107,14 +125,26 @@ def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
     trainer.run()
     rows = record.rows[1:]
     seconds = [num_envs * STEPS / row["time/steps_per_second"] for row in rows]
-    sections = {
+    spent = {
         f"{name}_seconds": round(
             np.mean([row.get(f"time/{name}", 0.0) * s for row, s in zip(rows, seconds, strict=True)]), 5
         )
         for name in SECTIONS
     }
     samples = round(num_envs * STEPS / float(np.mean(seconds)))
-    return {"num_envs": num_envs, "threads": threads, "workers": workers, "samples_per_second": samples, **sections}
+    return {"num_envs": num_envs, "threads": threads, "workers": workers, "samples_per_second": samples, **spent}
+
+
+def serial_shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return, by section, its share of an iteration on one thread, and what of it a second thread does not speed up."""
+    one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
+    found = []
+    for name in (name for name in SECTIONS if name != "collection"):
+        shares = [row[f"{name}_seconds"] / sum(row[f"{other}_seconds"] for other in SECTIONS) for row in one]
+        times = [second[f"{name}_seconds"] / first[f"{name}_seconds"] for first, second in zip(one, two, strict=True)]
+        serial = float(np.clip(2 * np.median(times) - 1, 0, 1))
+        found.append({"section": name, "share": f"{np.median(shares):.0%}", "serial": f"{serial:.0%}"})
+    return found
 
 
 def count() -> dict[str, float]:
@@ -181,22 +211,25 @@ def main() -> None:
     sizes = QUICK_SIZES if arguments.quick else SIZES
     output = arguments.output or (None if arguments.quick else RESULTS)
     if not arguments.refit:
-        rows = [measure(size, threads, 0) for size in sizes for threads in (1, 2)]
+        rows = [measure(size, threads, 0) for size in sizes for threads in sorted({1, 2, CORES})]
         rows += [measure(size, 1, workers) for size in sizes[1:3] for workers in (1, 2)]
         rows = [row | about() for row in rows]
-        print(table([{key: row[key] for key in MEASURED} for row in rows]))
+        print(table([{key: row[key] for key in (*MEASURED, *CPU)} for row in rows]))
         if output:
             write(output, rows)
     else:
         rows = read(output or RESULTS)
     constants = fit(rows) | count()
+    local = {(row["threads"], row["num_envs"]): int(row["samples_per_second"]) for row in rows if not row["workers"]}
     predictions = [
         {"machine": name, "num_envs": size}
         | {bound: predict(size, *machine, constants, linear=bound == "high") for bound in ("low", "high")}
+        | {"measured": "" if machine[1] else local.get((machine[0], size), "")}
         for name, machine in MACHINES.items()
         for size in sizes
     ]
-    print(table(predictions), *(f"{name} {value:.4g}" for name, value in constants.items()), sep="\n")
+    print(table(serial_shares(rows)), table(predictions), sep="\n")
+    print(*(f"{name} {value:.4g}" for name, value in constants.items()), sep="\n")
     if output:
         write(output.with_name(f"{output.stem}_predicted.csv"), predictions)
         values = [{"constant": name, "value": f"{value:.4g}"} for name, value in (constants | GPU).items()]

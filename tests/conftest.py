@@ -4,6 +4,7 @@ import runpy
 import sys
 import traceback
 from contextlib import chdir, redirect_stderr, redirect_stdout
+from copy import deepcopy
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,6 +17,7 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
+from omegaconf import OmegaConf
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions import generated_library
@@ -30,8 +32,9 @@ settings.load_profile("ci" if os.environ.get("CI") else "default")
 
 
 def pytest_collection_finish():
-    """Let the garbage collector pass over what was imported, which lives to the end."""
+    """Let the garbage collector pass seldom, and over what tests leave alone: imports live to the end."""
     gc.freeze()
+    gc.set_threshold(100_000)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -41,6 +44,16 @@ def _corpora_generated_once():
     with pytest.MonkeyPatch.context() as patch:
         for module in ("motions", "tasks.initial_states"):
             patch.setattr(f"torchrl_mcp.envs.{module}.generated_library", once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _settings_parsed_once():
+    """Parse the same text once: a quarter of the time in which Hydra composes a run."""
+    load = OmegaConf.load
+    once = cache(lambda text: load(StringIO(text)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", lambda f: deepcopy(once(f.read())) if hasattr(f, "read") else load(f))
         yield
 
 

@@ -158,7 +158,7 @@ def imports_of_mujoco():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks a process that has imported torch")
 def test_tensordict_and_with_it_triton_is_imported_before_mujoco():
     code = (
-        "import importlib, os, sys, torch\n"
+        "import importlib, os, sys, torch, torch._dynamo\n"
         "class Watch:\n"
         "    def find_spec(name, *_):\n"
         "        if name == 'mujoco':\n"

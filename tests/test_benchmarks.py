@@ -136,11 +136,14 @@ def test_the_model_of_scaling_finds_the_constants_that_made_the_times_and_predic
         row = {"num_envs": size, "threads": threads, "workers": 0}
         row["physics_seconds"] = steps * size * 1e-4 / (1, 1.5)[threads - 1]
         row["update_seconds"] = steps * size * 2e-4 / (1, 2)[threads - 1]
-        rows.append(row | {"forward_seconds": steps * (1e-3 + size * 1e-5), "other_seconds": steps * 2e-3})
+        row |= {"forward_seconds": steps * (1e-3 + size * 1e-5), "other_seconds": steps * 2e-3}
+        rows.append(row | {"collection_seconds": 0.0})
     found = scaling["fit"](rows)
     expected = {"physics_per_sample": 1e-4, "physics_gain": 1.5, "update_per_sample": 2e-4, "update_gain": 2.0}
     expected |= {"forward_per_step": 1e-3, "forward_per_sample": 1e-5, "other_per_step": 2e-3, "other_per_sample": 0}
     assert found == pytest.approx(expected, abs=1e-9)
+    shares = {row["section"]: row["serial"] for row in scaling["serial_shares"](rows)}
+    assert shares == {"physics": "33%", "forward": "100%", "update": "0%", "other": "100%"}
     # Four cores: a third of physics is serial by Amdahl's law, and the update divides by four.
     seconds = 1e-4 * (1 / 3 + 2 / 3 / 4) + 2e-4 / 4 + 1e-5 + 3e-3 / 256
     assert scaling["predict"](256, 4, False, found, linear=False) == pytest.approx(1 / seconds, rel=1e-3)

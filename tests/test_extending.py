@@ -161,6 +161,7 @@ def run(kind, command, tmp_path_factory):
             *addition.settings.split(),
             *TINY.split(),
             "evaluation.episodes=2",
+            "++task.evaluation.max_episode_steps=20",
             cwd=folder,
         )
         assert outcome.returncode == 0, outcome.stderr

@@ -72,9 +72,15 @@ def runs(request, tmp_path_factory):
     return pretrained, experiment.train(configure(folder / "transfer", *transfer, f"pretrained={pretrained}"))
 
 
-def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_freeze(runs):
-    pretrained, transferred = runs
-    cfg, agent, env = policies.restore(transferred, num_envs=1, seed=0)
+@pytest.fixture(scope="module")
+def restored(runs):
+    """Configuration, agent and environment after transfer."""
+    return policies.restore(runs[1], num_envs=1, seed=0)
+
+
+def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_freeze(runs, restored):
+    pretrained, _ = runs
+    cfg, agent, env = restored
     after = {name: fingerprint(part) for name, part in agent.parts.items()}
     file = checkpoint.find(pretrained) if pretrained else None
     start = {name: fingerprint(part) for name, part in build.make_agent(cfg, env, file).parts.items()}
@@ -84,7 +90,7 @@ def test_transfer_begins_with_what_it_keeps_and_changes_all_that_it_does_not_fre
     assert {name for name in start if start[name] == after[name]} == set(cfg.transfer.freeze)
 
 
-def test_a_resumed_transfer_continues_to_the_same_numbers(runs, tmp_path):
+def test_a_resumed_transfer_continues_to_the_same_numbers(runs, restored, tmp_path):
     _, transferred = runs
     copy = tmp_path / "copy"
     shutil.copytree(transferred, copy)
@@ -92,17 +98,16 @@ def test_a_resumed_transfer_continues_to_the_same_numbers(runs, tmp_path):
     experiment.resume(copy)
     assert rows(copy) == rows(transferred)
     assert len(rows(copy)) == 2
-    assert fingerprints(copy) == fingerprints(transferred)
+    assert fingerprints(copy) == {name: fingerprint(part) for name, part in restored[1].parts.items()}
 
 
-def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs):
+def test_a_checkpoint_is_evaluated_with_and_without_exploration(runs, restored):
     results = policies.evaluation(runs[1], episodes=3, seed=0, max_episode_steps=5)
     for numbers in (results["deterministic"], results["stochastic"]):
         assert 1 <= numbers["length"] <= 5
         assert 0 < numbers["return"] == pytest.approx(numbers["return"])
     assert results["deterministic"]["return"] != results["stochastic"]["return"]
-    _, agent, _ = policies.restore(runs[1], num_envs=1, seed=0)
-    found = results["stochastic"]["diagnostics"]
+    agent, found = restored[1], results["stochastic"]["diagnostics"]
     for key, name in {"gates": "gates/effective_primitives", "begins": "options/effective_options"}.items():
         assert (name in found) == (key in agent.actor.stored)
         assert 1 <= found.get(name, 1) <= 8 + 1e-4

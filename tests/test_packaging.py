@@ -85,11 +85,12 @@ def test_wheel_holds_every_source_and_data_file(wheel):
     assert "torchrl_mcp/py.typed" in packed
 
 
-@pytest.mark.parametrize("module", ["torchrl_mcp", "torchrl_mcp.envs", "torchrl_mcp.conf"])
-def test_installed_wheel_imports_outside_the_checkout(installed, tmp_path, module):
-    result = run_code(f"import {module} as module; print(module.__file__)", cwd=tmp_path, path=[installed])
+def test_installed_wheel_imports_outside_the_checkout(installed, tmp_path):
+    code = "import torchrl_mcp, torchrl_mcp.envs as envs, torchrl_mcp.conf as conf\n"
+    code += "print(torchrl_mcp.__file__, envs.__file__, conf.__file__, sep='\\n')"
+    result = run_code(code, cwd=tmp_path, path=[installed])
     assert result.returncode == 0, result.stderr
-    assert Path(result.stdout.strip()).is_relative_to(installed)
+    assert [Path(line).is_relative_to(installed) for line in result.stdout.splitlines()] == [True] * 3
 
 
 @pytest.mark.skipif(not (ROOT / "conf/train.yaml").exists(), reason="conf/train.yaml is not written yet")

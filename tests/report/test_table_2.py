@@ -1,13 +1,19 @@
-"""The picture of Table 2: what its bars are as long as."""
+"""Table 2 of the published runs, and its picture: what its bars are as long as."""
 
 import csv
+import json
+import re
 from collections import defaultdict
+from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
 from statistics import mean
 
 import pytest
 
+from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import cells
+from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
 from torchrl_mcp.report.table_2 import describe, draw_table_2
 
@@ -31,6 +37,46 @@ def bars(panel):
         method = round(middle)
         found[names[method]]["ours" if middle < method else "paper"] = bar.get_width()
     return dict(found)
+
+
+def mean_return(evaluations):
+    return mean(each["normalised_return"] for each in evaluations)
+
+
+def test_the_published_runs_make_table_2(published, tmp_path):
+    """The table has the mean of the evaluations in the archive, cell by cell."""
+    folder, runs = published
+    evaluations = defaultdict(lambda: defaultdict(list))
+    for path in folder.rglob("evaluation.json"):
+        settings = path.with_name("config.yaml").read_text()
+        task, character, method, stage, exploration = (
+            re.search(rf"^{group}:\n(?:  .*\n)*?  name: (\w+)", settings, re.MULTILINE)[1]
+            for group in ("task", "character", "method", "stage", "exploration")
+        )
+        if stage == "transfer":
+            steps = int(re.search(r"total_frames: (\d+)", settings)[1])
+            pretraining = re.search(r"^budget:\n(?:  .*\n)*?  pretrain: (\d+)", settings, re.MULTILINE)[1]
+            found = json.loads(path.read_text())["deterministic"]
+            evaluations[task, character, method, steps][exploration, pretraining].append(found)
+    table = (PUBLISHED / "table.md").read_text().splitlines()
+    head, _, *lines = ([cell.strip() for cell in line.strip("|").split("|")] for line in table if line.startswith("|"))
+    shown = {
+        (line[0], column): cell for line in lines[::2] for column, cell in zip(head[1:], line[1:], strict=True) if cell
+    }
+    assert shown
+    for (row, column), cell in shown.items():
+        task, character = row.lower().replace("t-rex", "trex").split(", ")
+        method = column.removesuffix(", short").lower().replace(" ", "_")
+        budgets = {steps: kinds for (*named, steps), kinds in evaluations.items() if named == [task, character, method]}
+        kinds = budgets[max(budgets) if column == "Scratch" else min(budgets)].values()
+        best, seeds = max(((mean_return(seeds), seeds) for seeds in kinds), key=itemgetter(0))
+        successes = [each["metrics"]["success"] for each in seeds if task in ("carry", "dribble")]
+        share = f", {mean(successes):.0%}" if successes else ""
+        assert cell == f"{best:.3f}{share} ({len(seeds)})"
+    page = report(runs, [], moment=datetime.now(UTC))["report.md"]
+    assert all(re.match(r"[\d.]+", cell)[0] in page for cell in shown.values())
+    save_figure(draw_table_2(cells(runs)), tmp_path / "table_2")
+    assert (tmp_path / "table_2.svg").read_text() == (PUBLISHED / "table_2.svg").read_text()
 
 
 def test_bars_are_as_long_as_the_published_runs_returns(published):

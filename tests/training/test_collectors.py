@@ -19,7 +19,6 @@ from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment, records
 from torchrl_mcp.training import checkpoint, collectors
 from torchrl_mcp.training.collectors import Batches, LocalSource, RemoteSource
-from torchrl_mcp.training.metrics import MetricsWriter
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads
 
@@ -112,7 +111,8 @@ def test_a_source_refuses_the_state_of_another_kind(source, written):
         source.load_state_dict(object.__new__(source), state)
 
 
-def test_every_environment_of_every_worker_is_another_and_remembers_its_own_options_in_bfloat16(tmp_path):
+def test_every_environment_of_every_worker_is_another_and_a_killed_worker_is_named_within_seconds(tmp_path):
+    """Each environment remembers its own options, in bfloat16; of the workers, none is left."""
     cfg = configure(tmp_path, "method=option_critic", "epsilon=1")
     source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2, num_threads=1)
     product = TensorDictModule(torch.nn.LazyLinear(1), in_keys=["observation"], out_keys=["product"])
@@ -121,9 +121,15 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     with threads(3):  # the learner's, which workers do not diminish
         source.start(policy, Batches(80, torch.device("cpu"), autocast=True, stopwatch=watch))
         batch = source.collect()
-        during = torch.get_num_threads()
+        during, workers, killed = torch.get_num_threads(), source._workers, time.monotonic()
+        workers[1].kill()
+        with pytest.raises(ChildProcessError, match=r"worker 1 of 2 .* has ended by signal SIGKILL"):
+            source.collect()
         source.stop()
         assert (during, torch.get_num_threads()) == (3, 3)
+    assert time.monotonic() - killed < 15
+    assert len(workers) == 2
+    assert not set(workers) & set(multiprocessing.active_children())
     assert batch.shape == (4, 20)
     assert batch["product"].dtype is torch.bfloat16
     for key in ("observation", "action"):
@@ -131,25 +137,6 @@ def test_every_environment_of_every_worker_is_another_and_remembers_its_own_opti
     assert batch["option"].unique().numel() > 4  # of eight, chosen at random
     assert batch["held_option"][:, 1:].equal(batch["option"][:, :-1])
     assert watch.seconds["collection"] > 0
-
-
-def test_a_killed_worker_ends_the_run_within_seconds_by_name_and_leaves_none(tmp_path, monkeypatch):
-    def begin(source, *arguments, **settings):
-        start(source, *arguments, **settings)
-        workers.extend(source._workers)
-
-    def kill_one(writer, metrics, *, step):
-        workers[1].kill()
-        killed.append(time.monotonic())
-
-    start, workers, killed = RemoteSource.start, [], []
-    monkeypatch.setattr(RemoteSource, "start", begin)
-    monkeypatch.setattr(MetricsWriter, "write", kill_one)
-    with pytest.raises(ChildProcessError, match=r"worker 1 of 2 .* has ended by signal SIGKILL"):
-        experiment.train(configure(tmp_path, "collector=processes"))
-    assert time.monotonic() - killed[0] < 15
-    assert len(workers) == 2
-    assert not set(workers) & set(multiprocessing.active_children())
 
 
 @pytest.mark.slow

@@ -45,6 +45,7 @@ def pretrained(tmp_path_factory):
     return experiment.train(configure(tmp_path_factory.mktemp("runs") / "mcp"))
 
 
+@pytest.mark.slow
 def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     settings = ["autocast=true", "checkpoint_interval=1", "training.total_frames=768"]
@@ -87,7 +88,7 @@ def test_the_trajectory_source_is_stopped_when_a_run_fails(tmp_path, monkeypatch
     "overrides",
     [
         ["method=scratch", "task=heading", "symmetry=augment", "learned_std=true", "width=0.1"],
-        ["method=latent_space", "task=imitation", "symmetry=loss", "learned_std=true", "width=0.1"],
+        ["method=latent_space", "task=imitation", "symmetry=loss", "learned_std=true", "width=0.1", "autocast=true"],
     ],
     ids=" ".join,
 )
@@ -109,9 +110,9 @@ def test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path, pretrained):
-    experiment.train(configure(tmp_path / "same"))
+    experiment.train(configure(tmp_path / "same", "training.total_frames=256"))
     experiment.train(configure(tmp_path / "other", "seed=1", ONE_BATCH))
-    assert rows(tmp_path / "same") == rows(pretrained)
+    assert rows(tmp_path / "same") == rows(pretrained)[:2]
     assert rows(tmp_path / "other")[0] != rows(pretrained)[0]
 
 
@@ -214,7 +215,7 @@ def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all
     assert numbers == {"step": {1}, "update": {2}}
 
 
-@pytest.mark.parametrize(("method", "autocast"), [("mcp", False), ("option_critic", False), ("option_critic", True)])
+@pytest.mark.parametrize(("method", "autocast"), [("mcp", False), ("option_critic", True)])
 def test_actor_and_critic_learn_the_same_at_the_same_time_as_in_turn_to_the_bit(
     tmp_path, monkeypatch, method, autocast
 ):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from statistics import fmean
 from typing import Any
 
 from torchrl_mcp.analysis.curves import learning_curves, plot_curves
@@ -134,9 +135,9 @@ class Section:
 
     def is_best(self, cell: Cell, mode: str) -> bool:
         """Whether a cell has the highest of at least two means."""
-        means = [estimate.value for row in self.rows if (estimate := row.cell.mean(mode))]
-        own = cell.mean(mode)
-        return own is not None and len(means) > 1 and own.value == max(means)
+        means = [fmean(returns) for row in self.rows if (returns := row.cell.returns(mode))]
+        own = cell.returns(mode)
+        return bool(own) and len(means) > 1 and fmean(own) == max(means)
 
 
 @dataclass(frozen=True)
