@@ -21,16 +21,32 @@ class Curriculum:
         motions: Motions for initial states, None for the character's generated ones.
         mixture: Alternatives to the task's ranges, see :class:`~torchrl_mcp.envs.tasks.ranges.Ranges`.
         reward_weights: Weights of the terms of the reward for training; None to train with the task's own reward.
+        target_distance_power: Power of the distance to the target in the reward with other weights.
         random_first_length: Shorten the first episodes by different lengths, evenly spread over the simulations, so
             that these are at different times of their episodes: otherwise a batch of short trajectories would cover a
             single time.
+        discount: Discount factor of the learner, for the worth of a success, which ends the episode; None lets the
+            episode go on.
+
+    Raises:
+        ValueError: If the discount is out of range.
     """
 
     initial_states: str | Mapping[str, float] = "rest"
     motions: MotionLibrary | Mapping[str, MotionClip] | None = None
     mixture: Sequence[Mapping[str, Any]] = ()
     reward_weights: Sequence[float] | None = None
+    target_distance_power: float = 1
     random_first_length: bool = False
+    discount: float | None = 0.99
+
+    def __post_init__(self) -> None:
+        if self.discount is not None and not 0 < self.discount <= 1:
+            raise ValueError(f"discount={self.discount} is out of range: pass the learner's, above 0 and at most 1")
+        if self.reward_weights is not None and self.discount == 1:
+            raise ValueError(
+                "reward_weights with discount=1: a success is worth full reward for ever, pass a discount below 1"
+            )
 
     @classmethod
     def of(cls, given: "Curriculum | Mapping[str, Any] | None") -> "Curriculum":

@@ -43,10 +43,7 @@ RELEASE_GAP = DROP + RESTING_GAP
 """Largest distance in metres between box and top at which the joint opens, reached at the box's initial height."""
 
 
-PROXIMITY_SCALE = 0.25
-"""Per square metre, how fast the reward for being near the box falls with its distance."""
-
-carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=PROXIMITY_SCALE)
+carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity_scale=0.25)
 """The reward with the weights of its four terms: the character's speed towards the box and its distance from the box,
 and the speed of the box towards the target and its distance from the target."""
 
@@ -74,7 +71,7 @@ class Carry(PDCharacterEnv):
     box at rest on the target has a printed reward of at most 0.73; with the second variant it is 1.
 
     With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -209,10 +206,17 @@ class Carry(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        weights = self.curriculum.reward_weights
+        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
         assert weights is not None
-        where, scale = (*self._motion(), self.success()), PROXIMITY_SCALE
-        return training_reward(*where, weights=weights, proximity_scale=scale, speed=self.speed)
+        power, speed = aids.target_distance_power, self.speed
+        reward = carry_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
+
+    def terminated(self) -> Tensor:
+        """Whether a success ends the episode, as it does in training with other weights of the reward."""
+        aids = self.curriculum
+        ends = aids.reward_weights is not None and aids.discount is not None
+        return self.success() if ends else super().terminated()
 
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""

@@ -56,10 +56,7 @@ SUCCESS_REACH = 2.0
 """Largest distance in metres between character and ball for success."""
 
 
-PROXIMITY_SCALE = 0.5
-"""Per square metre, how fast the reward for being near the ball falls with its distance."""
-
-dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=PROXIMITY_SCALE)
+dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)
 """The reward with the weights of its four terms: the character's speed towards the ball and its distance from the ball,
 and the speed of the ball towards the target and its distance from the target."""
 
@@ -78,7 +75,7 @@ class Dribble(PDCharacterEnv):
 
     The variants of the reward are those of :class:`~torchrl_mcp.envs.Carry`: a ball at rest at the target has a printed
     reward of at most 0.73. With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -187,10 +184,17 @@ class Dribble(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        weights = self.curriculum.reward_weights
+        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
         assert weights is not None
-        where, scale = (*self._motion(), self.success()), PROXIMITY_SCALE
-        return training_reward(*where, weights=weights, proximity_scale=scale, speed=self.speed)
+        power, speed = aids.target_distance_power, self.speed
+        reward = dribble_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
+
+    def terminated(self) -> Tensor:
+        """Whether a success ends the episode, as it does in training with other weights of the reward."""
+        aids = self.curriculum
+        ends = aids.reward_weights is not None and aids.discount is not None
+        return self.success() if ends else super().terminated()
 
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""

@@ -136,7 +136,6 @@ def transport_reward(
     proximity_scale: float,
     speed: float,
     target_distance_power: float,
-    object_speed: Tensor | float | None = None,
 ) -> Tensor:
     r"""Reward of the carry and dribble tasks: go to an object, stay with it, and move it to its target.
 
@@ -160,7 +159,6 @@ def transport_reward(
         proximity_scale: :math:`c`, per square metre.
         speed: Target speed :math:`\hat{v}`, in m/s. Paper: 1.
         target_distance_power: :math:`p`. Paper: 2.
-        object_speed: :math:`\hat{v}` in :math:`r^{bv}`, shape ``(*B)``, if it is another.
 
     Returns:
         Reward, shape ``(*B)``.
@@ -171,10 +169,8 @@ def transport_reward(
     """
     ways = torch.stack([position - com, target - position])
     towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a zero vector
-    speeds = (towards * torch.stack([com_velocity, velocity])).sum(-1)
-    cv = (speeds[0] - speed).clamp(max=0.0).square()
-    bv = (speeds[1] - (speed if object_speed is None else object_speed)).clamp(max=0.0).square()
-    cp, bp = ways.square().sum(-1)
+    missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
+    (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
     exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
     return exponents.exp() @ _on(exponents.device, tuple(weights)).to(exponents.dtype)
 
@@ -198,56 +194,41 @@ def idle_reward(weights: Sequence[float], speed: float) -> float:
 
 
 def training_reward(
-    com: Tensor,
-    com_velocity: Tensor,
-    position: Tensor,
-    velocity: Tensor,
-    target: Tensor,
+    reward: Tensor,
     success: Tensor,
+    com_velocity: Tensor,
     *,
     weights: Sequence[float],
-    proximity_scale: float,
     speed: float,
+    discount: float | None,
 ) -> Tensor:
-    r"""Reward for training to carry and dribble: zero for standing still far away, and greatest while successful.
+    r"""Reward for training to carry and dribble: about zero for standing still, and greatest for a success.
 
     .. math::
         r' = \begin{cases}
-            \sum_i w_i \frac{1 + \exp(-4 \|v_{com}\|^2)}{2} - r_{idle} & \text{while successful} \\
+            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success, if it ends the episode} \\
+            \sum_i w_i \frac{1 + \exp(-4 \|v_{com}\|^2)}{2} - r_{idle} & \text{while successful, if it does not} \\
             r - r_{idle} & \text{else}
         \end{cases}
 
-    where :math:`r` is :func:`transport_reward` with :math:`p = 1` and, in :math:`r^{bv}`, with a target speed that
-    falls in the last metre, :math:`\min(\hat{v}, \|x_b - x_{tar}\| / 1 \text{ s})`. With the printed reward, standing
-    still earns a third of the best return, and an object that has arrived earns less than one that moves: policies
-    learn to stand, and the ball rolls on. Here the character earns most by standing where the object is at its target.
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success
+    that ends the episode is worth the discounted return of all terms being 1 for ever: otherwise a character that walks
+    on knocks the box off the target, and a success is worth little. A gate that can stand already learns to do so at
+    the target if the episode goes on.
 
     Args:
-        com: Centre of mass of the character :math:`x_{com}`, shape ``(*B, 2)``, in metres.
-        com_velocity: Velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
-        position: Position of the object :math:`x_b`, shape ``(*B, 2)``, in metres.
-        velocity: Velocity of the object :math:`v_b`, shape ``(*B, 2)``, in m/s.
-        target: Position of the target :math:`x_{tar}`, shape ``(*B, 2)``, in metres.
+        reward: :func:`transport_reward` with these weights, shape ``(*B)``.
         success: Whether the object is at its target, shape ``(*B)``, bool.
+        com_velocity: Velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
         weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
-        proximity_scale: :math:`c` of :func:`transport_reward`, per square metre.
-        speed: Target speed :math:`\hat{v}`, in m/s.
+        speed: Target speed :math:`\hat{v}`, in m/s, for the :func:`idle_reward`.
+        discount: Discount factor :math:`\gamma` of the learner, below 1; None if the episode goes on after a success.
 
     Returns:
         Reward, shape ``(*B)``.
     """
-    left = torch.linalg.vector_norm(target - position, dim=-1)
-    moving = transport_reward(
-        com,
-        com_velocity,
-        position,
-        velocity,
-        target,
-        weights=weights,
-        proximity_scale=proximity_scale,
-        speed=speed,
-        object_speed=left.clamp(max=speed),
-        target_distance_power=1,
-    )
-    standing = sum(weights) * (1 + velocity_reward(com_velocity, torch.zeros_like(com_velocity))) / 2
-    return moving.where(~success, standing) - idle_reward(weights, speed)
+    full, idle = sum(weights), idle_reward(weights, speed)
+    if discount is not None:
+        return (reward - idle).masked_fill(success, (full - idle) / (1 - discount))
+    standing = full * (1 + velocity_reward(com_velocity, torch.zeros_like(com_velocity))) / 2
+    return reward.where(~success, standing) - idle

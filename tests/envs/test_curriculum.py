@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading
 
 WEIGHTS = [0.6, 0.1, 1.0, 2.0]
 WEIGHED = {"reward_weights": WEIGHTS}
@@ -46,21 +46,45 @@ def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
         progress = ((thing - before[1]) * 30 * left).sum(-1) / np.linalg.norm(left, axis=-1)
         expected = 0.6 * (np.exp(-1.5 * np.minimum(0, pace - 1) ** 2) - math.exp(-1.5))
         expected += 0.1 * np.exp(-SCALE[task] * (ahead**2).sum(-1))
-        asked = np.minimum(1, np.linalg.norm(left, axis=-1))  # less speed in the last metre
-        expected += 1.0 * (np.exp(-(np.minimum(0, progress - asked) ** 2)) - math.exp(-1))
+        expected += 1.0 * (np.exp(-(np.minimum(0, progress - 1) ** 2)) - math.exp(-1))
         expected += 2.0 * np.exp(-0.5 * np.linalg.norm(left, axis=-1))
         np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
 
 
-def test_who_stands_where_the_ball_is_at_its_target_earns_most_and_goes_on():
+def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
+    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 1.0), "terminate_on_fall": False}
+    env = make(Dribble, curriculum={**WEIGHED, "discount": 0.9}, **there)
+    full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
+    for_ever = sum(full * 0.9**step for step in range(1000))
+    state, generator, successes, others = env.reset(), torch.Generator().manual_seed(0), 0, 0
+    for _ in range(60):
+        action = 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
+        taken, state = env.step_and_maybe_reset(state.set("action", action))
+        success, standing = taken["next", "success"], taken["next", "task_reward"] != 0  # who has fallen earns nothing
+        assert torch.equal(taken["next", "terminated"], success)
+        ended = taken["next", "reward"][success & standing]
+        torch.testing.assert_close(ended, torch.full_like(ended, for_ever))
+        assert (taken["next", "reward"][~success] < full).all()
+        successes, others = successes + len(ended), others + int((~success).sum())
+    assert successes > 0
+    assert others > 0
+
+
+def test_without_a_discount_the_episode_goes_on_and_who_stands_earns_most():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     full, idle = sum(WEIGHTS), 0.6 * math.exp(-1.5) + 1.0 * math.exp(-1)
-    for state, before, (com, *_) in outcomes(make(Dribble, curriculum=WEIGHED, **there), 3):
+    env = make(Dribble, curriculum={**WEIGHED, "discount": None}, **there)
+    for state, before, (com, *_) in outcomes(env, 3):
         squared_speed = ((com - before[0]) ** 2).sum(-1) * 900
         assert state["success"].all()
         assert not state["done"].any()
         expected = full * (1 + np.exp(-4 * squared_speed)) / 2 - idle
         np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
+
+
+def test_full_reward_for_ever_needs_a_discount():
+    with pytest.raises(ValueError, match=r"reward_weights with discount=1: .* pass a discount below 1"):
+        Curriculum(reward_weights=WEIGHTS, discount=1)
 
 
 def test_without_weights_a_success_does_not_end_the_episode():
@@ -93,7 +117,7 @@ def test_who_has_fallen_earns_neither(task):
 
 def test_standing_still_far_from_everything_earns_nothing():
     far = {"object_distances": (9.0, 10.0), "target_distances": (9.0, 10.0)}
-    state = outcomes(make(Dribble, curriculum=WEIGHED, **far), 1, push=0.0)[0][0]
+    state = outcomes(make(Dribble, curriculum=WEIGHED | {"target_distance_power": 2}, **far), 1, push=0.0)[0][0]
     assert state["reward"].abs().max() < 0.03
     assert state["task_reward"].min() > 0.1
 
@@ -111,6 +135,7 @@ def test_other_numbers_of_weights_than_the_reward_has_terms_are_refused(task, nu
     ("curriculum", "message"),
     [
         ({"emphasis": None}, r"curriculum names \['emphasis'\]: pass some of initial_states, motions, mixture"),
+        ({"discount": 0}, "discount=0 is out of range: pass the learner's, above 0 and at most 1"),
     ],
 )
 def test_a_wrong_curriculum_is_named_with_a_remedy(curriculum, message):

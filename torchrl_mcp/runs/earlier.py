@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-REMOVED = {"failure_weighting": 0.0, "shaping": {}, "discount": None}
+REMOVED = {"failure_weighting": 0.0, "shaping": {}}
 """Settings of environments that this version lacks, with the values at which they had no effect."""
 
-AIDS = ("initial_states", "mixture", "emphasis", "staggered")
+AIDS = ("initial_states", "mixture", "emphasis", "staggered", "discount")
 """Settings of environments that are one setting in this version, ``curriculum``."""
 
 ENGINES = {"mujoco": "mujoco_threads", "warp": "mujoco_warp"}
@@ -43,7 +43,6 @@ def require_resumable(config: Mapping[str, Any]) -> None:
         ValueError: If it was trained with something that this version lacks.
     """
     stage = config["task"][config["stage"]["name"]]
-    stage = {**stage, **(stage.get("curriculum") or {})}
     if lost := [name for name, value in REMOVED.items() if stage.get(name, value) != value]:
         raise ValueError(
             f"the run is trained with {lost[0]}={stage[lost[0]]}, which this version lacks: resume it with the version "
@@ -71,11 +70,13 @@ def _curriculum(
     mixture: Any = (),
     emphasis: Any = None,
     staggered: bool = False,
+    discount: float = 0.99,
 ) -> dict[str, Any] | None:
     """Return a curriculum from an earlier version's settings, or None if training was like the task itself."""
     from_rest = initial_states == "rest" or (initial_states != "motions" and not initial_states.get("motions"))
     if from_rest and not mixture and not emphasis and not staggered:
         return None
     weights = None if emphasis is None else emphasis["weights"]
-    made = {"initial_states": initial_states, "mixture": mixture, "reward_weights": weights}
-    return {**made, "random_first_length": staggered}
+    power = {} if emphasis is None else {"target_distance_power": emphasis["target_distance_power"]}
+    made = {"initial_states": initial_states, "mixture": mixture, "reward_weights": weights, **power}
+    return {**made, "random_first_length": staggered, "discount": discount}

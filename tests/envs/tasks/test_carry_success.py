@@ -39,14 +39,16 @@ def joined(env):
     return env.simulation.state["eq_active"].flatten().tolist()
 
 
-def test_in_training_a_box_that_stands_on_the_target_earns_all_while_the_character_stands(over_the_target):
+def test_a_box_that_stands_on_the_target_when_the_joint_opens_ends_the_episode_with_full_reward_for_ever(
+    over_the_target,
+):
     weights = [1.0, 0.2, 1.0, 2.0]
-    env = make(curriculum={"reward_weights": weights})
+    env = make(curriculum={"reward_weights": weights, "discount": 0.9})
     outcome = play(env, env.reset(over_the_target(env, 0.005), set_state=True), 1)
     full = sum(weights) - np.exp(-1.5) - np.exp(-1)
     assert outcome["success"].all()
-    assert not outcome["done"].any()
-    np.testing.assert_allclose(outcome["reward"], full, rtol=0.02)
+    assert outcome["terminated"].all()
+    np.testing.assert_allclose(outcome["reward"], 10 * full, rtol=1e-6)
 
 
 def test_the_reward_is_1_from_the_step_on_in_which_the_joint_opens_if_a_success_is_rewarded(over_the_target):
