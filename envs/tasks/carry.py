@@ -16,7 +16,7 @@ from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
-from torchrl_mcp.envs.tasks.rewards import reward_until_success, transport_reward
+from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.envs.tasks.tables import DROP, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
@@ -30,6 +30,7 @@ from torchrl_mcp.envs.tasks.transport import (
     pointers,
     require_transport,
 )
+from torchrl_mcp.envs.tasks.waypoints import carry_waypoint, place_seen
 
 OBJECTS = {"target": 7, "source": 7, "box": 13}
 """The objects in the order of the scene: target table, source table and box. How many numbers the goal has of each:
@@ -70,7 +71,7 @@ class Carry(PDCharacterEnv):
     box at rest on the target has a printed reward of at most 0.73; with the second variant it is 1.
 
     With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`, and a success ends the episode.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -88,6 +89,8 @@ class Carry(PDCharacterEnv):
         goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
             :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A table is 0.3 m wide, and in standardised metres
             this is less than a tenth.
+        waypoint: End the goal with the place where the character should go next,
+            :func:`~torchrl_mcp.envs.tasks.waypoints.carry_waypoint`, as :class:`.Location` shows places.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
@@ -120,12 +123,14 @@ class Carry(PDCharacterEnv):
         target_distance_power: float = 2,
         success_reward: bool = False,
         goal_positions: str = "metres",
+        waypoint: bool = False,
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
         require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
         self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
-        self.goal_positions, self.goal_layout = goal_positions, goal_layout(OBJECTS)
+        self.goal_positions, self.waypoint = goal_positions, waypoint
+        self.goal_layout = goal_layout(OBJECTS, waypoint)
         super().__init__(
             character,
             num_envs,
@@ -181,10 +186,18 @@ class Carry(PDCharacterEnv):
         state, objects = self.see(ids)
         return {
             "observation": state,
-            "goal": goal_of(objects, OBJECTS, self.goal_positions),
+            "goal": goal_of(objects, OBJECTS, self.goal_positions, *self._waypoints(ids)),
             "success": self.success()[ids].unsqueeze(-1),
             "box_taken": self.episode["taken"][ids].bool().unsqueeze(-1),
         }
+
+    def _waypoints(self, ids: Tensor | slice) -> list[Tensor]:
+        """The places to go to next, if the goal has them."""
+        if not self.waypoint:
+            return []
+        com, _, box, _, target = self._motion()
+        taken, held = self.episode["taken"] == 1, self._joined == 1
+        return [place_seen(self, carry_waypoint(com, box, target, taken, held), ids)]
 
     def reward(self) -> Tensor:
         """Reward of appendix D, or 1 while successful."""
@@ -192,16 +205,18 @@ class Carry(PDCharacterEnv):
         return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
 
     def training_reward(self) -> Tensor:
-        """See :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`."""
-        aids, weights = self.curriculum, self.curriculum.reward_weights
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
+        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
         assert weights is not None
-        power = aids.target_distance_power
-        reward = carry_reward(*self._motion(), weights=weights, speed=self.speed, target_distance_power=power)
-        return reward_until_success(reward, self.success(), weights=weights, speed=self.speed, discount=aids.discount)
+        power, speed = aids.target_distance_power, self.speed
+        reward = carry_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
 
     def terminated(self) -> Tensor:
         """Whether a success ends the episode, as it does in training with other weights of the reward."""
-        return super().terminated() if self.curriculum.reward_weights is None else self.success()
+        aids = self.curriculum
+        ends = aids.reward_weights is not None and aids.discount is not None
+        return self.success() if ends else super().terminated()
 
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
@@ -224,7 +239,7 @@ class Carry(PDCharacterEnv):
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return goal_mirror(OBJECTS)
+        return goal_mirror(OBJECTS, self.waypoint)
 
     def arrows(self, index: int) -> list[Arrow]:
         """Arrows from above the character to the box, and from above the box to the target."""

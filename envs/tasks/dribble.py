@@ -14,7 +14,7 @@ from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
-from torchrl_mcp.envs.tasks.rewards import reward_until_success, transport_reward
+from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     SUCCESS_DISTANCE,
@@ -29,6 +29,7 @@ from torchrl_mcp.envs.tasks.transport import (
     pointers,
     require_transport,
 )
+from torchrl_mcp.envs.tasks.waypoints import dribble_waypoint, place_seen
 
 OBJECTS = {"target": 3, "ball": 13}
 """The objects in the order of the scene: target and ball. How many numbers the goal has of each: position (3),
@@ -74,7 +75,7 @@ class Dribble(PDCharacterEnv):
 
     The variants of the reward are those of :class:`~torchrl_mcp.envs.Carry`: a ball at rest at the target has a printed
     reward of at most 0.73. With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`, and a success ends the episode.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -90,6 +91,8 @@ class Dribble(PDCharacterEnv):
         success_reward: Set the reward to 1 while successful.
         goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
             :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`.
+        waypoint: End the goal with the place where the character should go next,
+            :func:`~torchrl_mcp.envs.tasks.waypoints.dribble_waypoint`, as :class:`.Location` shows places.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
@@ -122,12 +125,14 @@ class Dribble(PDCharacterEnv):
         target_distance_power: float = 2,
         success_reward: bool = False,
         goal_positions: str = "metres",
+        waypoint: bool = False,
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
         require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
         self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
-        self.goal_positions, self.goal_layout = goal_positions, goal_layout(OBJECTS)
+        self.goal_positions, self.waypoint = goal_positions, waypoint
+        self.goal_layout = goal_layout(OBJECTS, waypoint)
         super().__init__(character, num_envs, furnish=add_pitch, max_episode_steps=max_episode_steps, **kwargs)
         self.initial_states = InitialStates(
             character, self.curriculum.initial_states, self.curriculum.motions, self.device
@@ -161,8 +166,16 @@ class Dribble(PDCharacterEnv):
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and where it sees target and ball."""
         state, objects = self.see(ids)
-        goal = goal_of(objects, OBJECTS, self.goal_positions)
+        goal = goal_of(objects, OBJECTS, self.goal_positions, *self._waypoints(ids))
         return {"observation": state, "goal": goal, "success": self.success()[ids].unsqueeze(-1)}
+
+    def _waypoints(self, ids: Tensor | slice) -> list[Tensor]:
+        """The places to go to next, if the goal has them."""
+        if not self.waypoint:
+            return []
+        com, _, ball, _, target = self._motion()
+        velocity = self.simulation.state["qvel"][:, -6:-4]  # the last step's is not known after a reset
+        return [place_seen(self, dribble_waypoint(com, ball, velocity, target), ids)]
 
     def reward(self) -> Tensor:
         """Reward of appendix D, or 1 while successful."""
@@ -170,16 +183,18 @@ class Dribble(PDCharacterEnv):
         return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
 
     def training_reward(self) -> Tensor:
-        """See :func:`~torchrl_mcp.envs.tasks.rewards.reward_until_success`."""
-        aids, weights = self.curriculum, self.curriculum.reward_weights
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
+        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
         assert weights is not None
-        power = aids.target_distance_power
-        reward = dribble_reward(*self._motion(), weights=weights, speed=self.speed, target_distance_power=power)
-        return reward_until_success(reward, self.success(), weights=weights, speed=self.speed, discount=aids.discount)
+        power, speed = aids.target_distance_power, self.speed
+        reward = dribble_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
 
     def terminated(self) -> Tensor:
         """Whether a success ends the episode, as it does in training with other weights of the reward."""
-        return super().terminated() if self.curriculum.reward_weights is None else self.success()
+        aids = self.curriculum
+        ends = aids.reward_weights is not None and aids.discount is not None
+        return self.success() if ends else super().terminated()
 
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
@@ -199,7 +214,7 @@ class Dribble(PDCharacterEnv):
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return goal_mirror(OBJECTS)
+        return goal_mirror(OBJECTS, self.waypoint)
 
     def arrows(self, index: int) -> list[Arrow]:
         """Arrows from above the character to the ball, and from above the ball to the target."""

@@ -16,7 +16,8 @@ from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
-from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, logarithmic, near, steps
+from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, near, steps
+from torchrl_mcp.envs.tasks.waypoints import place_seen
 
 STANDING_SPEED = 0.1
 """Speed of the centre of mass in m/s below which a character stands."""
@@ -185,24 +186,3 @@ class Location(PDCharacterEnv):
         """Cosine of the angle between heading and direction to face, 1 if any will do, ``(n,)``."""
         angle = self.episode["final_direction"][ids] - self.heading(ids)
         return angle.cos() if self.faces else torch.ones_like(angle)
-
-
-def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
-    """The goal of :class:`Location`, in the environment of any task.
-
-    Args:
-        env: The environment.
-        place: Places on the ground, ``(N, 2)``, in metres.
-        ids: Simulations, ``(n,)``.
-
-    Returns:
-        Each place relative to the centre of mass in the character's heading frame, with a logarithmic distance,
-        ``(n, 2)``.
-    """
-    return logarithmic(_turned((place - env.com[:, :2])[ids], -env.heading(ids)))
-
-
-def _turned(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Turn horizontal vectors ``(*B, 2)`` to the left by an angle in radians, ``(*B)``."""
-    (x, y), cos, sin = vectors.unbind(-1), angle.cos(), angle.sin()
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)

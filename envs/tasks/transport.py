@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import positive
-from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, Mirror, mirror_signs
+from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import SIZES
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.ranges import Ranges
@@ -104,21 +104,23 @@ def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low
     return radius
 
 
-def goal_of(objects: Tensor, sizes: Mapping[str, int], positions: str) -> Tensor:
+def goal_of(objects: Tensor, sizes: Mapping[str, int], positions: str, *others: Tensor) -> Tensor:
     """Goal of a task with objects, laid out as :func:`goal_layout` says, ``(*B, G)``.
 
     Args:
         objects: What the character sees of M objects, ``(*B, M, 13)``, see :meth:`.PDCharacterEnv.see`.
         sizes: How many of these numbers the goal has of each object, by name.
         positions: Form of the horizontal positions, one of :data:`POSITIONS`.
+        *others: What else the goal has, after the objects, ``(*B, F)``.
     """
     if positions == "logarithmic":
         objects = torch.cat([logarithmic(objects[..., :2]), objects[..., 2:]], -1)
-    return torch.cat([objects[..., index, :size] for index, size in enumerate(sizes.values())], -1)
+    seen = [objects[..., index, :size] for index, size in enumerate(sizes.values())]
+    return torch.cat([*seen, *(other.to(objects.dtype) for other in others)], -1)
 
 
-def goal_layout(sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Slices of the goal by object and quantity, from the number of entries of each object."""
+def goal_layout(sizes: Mapping[str, int], waypoint: bool) -> dict[str, slice]:
+    """Slices of the goal by object and quantity, from the number of entries of each object, and of the waypoint."""
     layout, start = {}, 0
     for name, shown in sizes.items():
         end = start + shown
@@ -126,12 +128,13 @@ def goal_layout(sizes: Mapping[str, int]) -> dict[str, slice]:
             if start < end:
                 layout[f"{name}.{quantity}"] = slice(start, start + size)
                 start += size
-    return layout
+    return {**layout, "waypoint": slice(start, start + len(VECTOR_SIGNS))} if waypoint else layout
 
 
-def goal_mirror(sizes: Mapping[str, int]) -> Mirror:
+def goal_mirror(sizes: Mapping[str, int], waypoint: bool) -> Mirror:
     """Return the reflection of a goal that exchanges left and right."""
-    return mirror_signs([sign for size in sizes.values() for sign in BODY_SIGNS[:size]])
+    signs = [sign for size in sizes.values() for sign in BODY_SIGNS[:size]]
+    return mirror_signs([*signs, *VECTOR_SIGNS] if waypoint else signs)
 
 
 def logarithmic(positions: Tensor) -> Tensor:

@@ -117,6 +117,42 @@ def test_training_begins_with_a_built_in_gate_and_the_primitives_under_it(tmp_pa
             assert torch.equal(trained.parts[part].state_dict()[name], value)
 
 
+def gate_logits(parts, state, goal):
+    return parts["gating"](parts["observation_normaliser"](state), parts["goal_normaliser"](goal))
+
+
+def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
+    known = "primitives,observation_normaliser,gating,goal_normaliser"
+    settings = [
+        "preset=smoke",
+        "logger=none",
+        "num_threads=1",
+        "progress_bar=false",
+        f"run_dir={tmp_path}",
+        "width=0.5",
+    ]
+    settings += ["method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
+    settings += [f"transfer.keep=[{known}]", f"transfer.freeze=[{known}]", "training.total_frames=128"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        experiment.train(compose("train", [*settings, "waypoint=true", "transfer.goal_entry=waypoint"]))
+    _, carry, env = policies.restore(tmp_path, num_envs=20, seed=0)
+    _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "location"), num_envs=1, seed=0)
+    scene = env.reset()
+    logits = gate_logits(carry.parts, scene["observation"], scene["goal"])
+    place = scene["goal"][:, env.goal_layout["waypoint"]]
+    torch.testing.assert_close(logits, gate_logits(gate.parts, scene["observation"], place))
+
+
+@pytest.mark.parametrize(("task", "known"), [("carry", "has target.position, "), ("heading", "is one entry")])
+def test_an_entry_that_the_goal_lacks_is_refused(task, known, tmp_path):
+    settings = ["preset=smoke", "logger=none", f"run_dir={tmp_path}", "method=mcp", f"task={task}", "character=biped"]
+    settings += ["stage=transfer", "pretrained=builtin", "transfer.goal_entry=place"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        cfg = compose("train", settings)
+    with pytest.raises(ValueError, match=f"transfer.goal_entry=place is no entry of the task's goal, which {known}"):
+        experiment.train(cfg)
+
+
 def test_a_gate_has_a_name_that_commands_take(library, monkeypatch, capsys):
     path = builtin.locate("builtin:biped-heading")
     assert path == builtin.builtin("mcp", "biped", "heading") == library / "mcp-biped-heading.torchrl"

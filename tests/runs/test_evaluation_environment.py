@@ -37,8 +37,8 @@ RUNS_OWN = {
     "imitation": {"terms", "switch_to"},
     "heading": {"speed"},
     "location": {"final_directions"},
-    "carry": {"goal_positions"},
-    "dribble": {"goal_positions"},
+    "carry": {"goal_positions", "waypoint"},
+    "dribble": {"goal_positions", "waypoint"},
 }
 """What an evaluation takes from training, as its file says: the reward, and what policies can follow and see."""
 CURRICULUM = {
@@ -46,7 +46,6 @@ CURRICULUM = {
     "mixture": [{"weight": 2.0}],
     "reward_weights": [0.6, 0.1, 1.0, 0.5],
     "random_first_length": True,
-    "discount": 0.5,
 }
 OTHER = {
     "curriculum": CURRICULUM,

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.training.transfer import FrozenParts, fingerprint, require_frozen_input, require_parts
+from torchrl_mcp.modules import Gating, JointGating, RunningNormaliser
+from torchrl_mcp.training.transfer import FrozenParts, fingerprint, require_frozen_input, require_parts, widen_goal
 
 
 def make():
@@ -145,3 +145,26 @@ def test_frozen_networks_whose_inputs_would_change_are_refused(keep, freeze, mes
 )
 def test_networks_are_frozen_with_their_normaliser_or_not_at_all(keep, freeze):
     require_frozen_input(make(), keep, freeze)
+
+
+@pytest.mark.parametrize("kind", [Gating, JointGating])
+def test_a_gate_whose_goal_becomes_an_entry_of_another_ignores_the_other_entries(kind):
+    torch.manual_seed(0)
+    narrow, wide = kind(5, 2, 4, width=0.05), kind(5, 7, 4, width=0.05)
+    widen_goal(wide, narrow, slice(3, 5))
+    state, goal = torch.randn(20, 5), torch.randn(20, 7)
+    torch.testing.assert_close(wide(state, goal), narrow(state, goal[:, 3:5]))
+
+
+def test_the_others_can_be_learned():
+    narrow, wide = Gating(5, 2, 4, width=0.05), Gating(5, 7, 4, width=0.05)
+    widen_goal(wide, narrow, slice(3, 5))
+    wide(torch.randn(20, 5), torch.randn(20, 7)).square().sum().backward()
+    assert (wide.goal_encoder[0].weight.grad.norm(dim=0) > 0).all()
+
+
+def test_a_normaliser_keeps_the_entry_and_leaves_the_others_as_they_are():
+    narrow, wide = RunningNormaliser(2), RunningNormaliser(4)
+    narrow.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
+    widen_goal(wide, narrow, slice(1, 3))
+    torch.testing.assert_close(wide(torch.tensor([3.0, 1.0, 30.0, 4.0])), torch.tensor([3.0, 0.0, 1.0, 4.0]))

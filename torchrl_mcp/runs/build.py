@@ -22,12 +22,12 @@ from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.publish import load_kept
-from torchrl_mcp.runs.requirements import require_arguments, require_environment, require_files
+from torchrl_mcp.runs.requirements import require_arguments, require_entry, require_environment, require_files
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import MetricsWriter, begin_after
 from torchrl_mcp.training.trainer import Trainer
-from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts
+from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts, widen_goal
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     if cfg.stage.name == "transfer":
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
         if pretrained is not None and cfg.transfer.keep:
-            load_kept(parts, cfg.transfer.keep, pretrained, partial(builtin, cfg.method.name, cfg.character.name))
+            _load_kept(cfg, parts, sizes, env, pretrained)
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze
@@ -117,6 +117,19 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
         checkpoint.load_agent(parts, pretrained)
     parts.to(cfg.device)
     return Agent(parts, actor, critic, frozen)
+
+
+def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: CharacterEnv, pretrained: Path) -> None:
+    """Load the parts that transfer keeps, which may have seen an entry of the goal alone."""
+    origin = partial(builtin, cfg.method.name, cfg.character.name)
+    if (name := cfg.transfer.goal_entry) is None:
+        load_kept(parts, cfg.transfer.keep, pretrained, origin)
+        return
+    entry = require_entry(env, name)
+    narrow = instantiate(cfg.parts)(sizes._replace(goal=entry.stop - entry.start))
+    load_kept(narrow, cfg.transfer.keep, pretrained, origin)
+    for kept in cfg.transfer.keep:
+        widen_goal(parts[kept], narrow[kept], entry)
 
 
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:

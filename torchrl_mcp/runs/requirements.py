@@ -150,6 +150,19 @@ def require_arguments(name: str, given: Collection[str]) -> None:
         raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 
+def require_entry(env: CharacterEnv, name: str) -> slice:
+    """Return the place of an entry in an environment's goal.
+
+    Raises:
+        ValueError: If the goal has no such entry.
+    """
+    layout: dict[str, slice] = getattr(env, "goal_layout", {})
+    if name not in layout:
+        known = f"has {', '.join(layout)}" if layout else "is one entry: leave it out"
+        raise ValueError(f"transfer.goal_entry={name} is no entry of the task's goal, which {known}")
+    return layout[name]
+
+
 def arguments(name: str) -> dict[str, inspect.Parameter]:
     """Return the parameters of a class or function by its name, with those that a class passes on to its bases."""
     made = pkgutil.resolve_name(name)

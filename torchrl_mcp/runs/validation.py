@@ -94,14 +94,15 @@ NAMES_BY_RULE: dict[Rule, str] = {
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     DISCOUNT: "gamma",
+    SHARE.or_null(): "discount",
     PROBABILITY: "terminations.initial",
     SHARE: """
-        lmbda discount epsilon momentum initial_states.rest
+        lmbda epsilon momentum initial_states.rest
         initial_states.motions motion_starts
     """,
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
-        terminate_when_unhealthy success_reward parts.blind on_device random_first_length restart_noise
+        terminate_when_unhealthy success_reward waypoint parts.blind on_device random_first_length restart_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
@@ -114,7 +115,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     WEIGHTS.or_null(): "reward_weights",
     NAMES: "transfer.freeze transfer.keep",
     TEXT: "device run_dir run_root",
-    TEXT.or_null(): "pretrained resume",
+    TEXT.or_null(): "pretrained resume goal_entry",
     _among(True, False, "auto"): "autocast",
     _among(*SWITCHES): "switch_to",
     _among(*CLIP_ENDS): "clip_end",

@@ -77,6 +77,31 @@ def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Co
         raise ValueError(f"transfer.keep names parts that need the {normaliser} of their pre-training: add it as well")
 
 
+@torch.no_grad()
+def widen_goal(wide: nn.Module, narrow: nn.Module, entry: slice) -> None:
+    """Copy a network that saw a goal into one that sees it as an entry of its own goal.
+
+    At first, the wide network ignores the other entries: their weights are zero, and normalisers leave them as they
+    are.
+
+    Args:
+        wide: Network whose last inputs are the goal, ``G``.
+        narrow: The same for the goal of the entry's size, whose weights are copied.
+        entry: The entry.
+
+    """
+    for name, tensor in wide.state_dict().items():
+        source = narrow.state_dict()[name]
+        if tensor.shape == source.shape:
+            tensor.copy_(source)
+            continue
+        own = source.shape[-1] - (entry.stop - entry.start)
+        if tensor.ndim > 1:
+            tensor.zero_()
+        tensor[..., :own] = source[..., :own]
+        tensor[..., own + entry.start : own + entry.stop] = source[..., own:]
+
+
 def fingerprint(module: nn.Module) -> str:
     """Return a hash of all parameters and buffers of ``module``, sensitive to every bit."""
     digest = hashlib.sha256()

@@ -1,0 +1,88 @@
+"""Where a character should go next: places on the ground, and how it sees them."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchrl_mcp.envs.base import ALL
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
+from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, logarithmic, near
+
+STRIDE = 1.0
+"""Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
+
+LEAD = 1.0
+"""Seconds of its motion by which a character looks ahead of a ball."""
+
+PUSH = 0.5
+"""Distance in metres to walk behind and beyond a ball, and to the side of it."""
+
+BEHIND = 0.7
+"""Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
+
+
+def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held: Tensor) -> Tensor:
+    """The box, then on the way on which the box in hand comes to the target, then where the character stands.
+
+    The way ends :data:`ARRIVAL_DISTANCE` past the target, because a gate that goes to places stops so much before them.
+
+    Args:
+        com: Centre of mass of the character, ``(N, 2)``, in metres.
+        box: Position of the box, ``(N, 2)``.
+        target: Position of the target, ``(N, 2)``.
+        taken: Whether the box was taken, ``(N,)``, bool.
+        held: Whether it is held, ``(N,)``, bool.
+
+    Returns:
+        Places, ``(N, 2)``.
+    """
+    way = target - box
+    length = torch.linalg.vector_norm(way, dim=-1, keepdim=True) + ARRIVAL_DISTANCE
+    bringing = com + normalize(way, dim=-1) * length.clamp(max=STRIDE)
+    held, done = held.unsqueeze(-1), (taken & ~held).unsqueeze(-1)
+    return torch.where(held, bringing, torch.where(done, com, box))
+
+
+def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor) -> Tensor:
+    """Around the ball until the character is behind it, then through it, then where the character stands.
+
+    The ball is where it will be after :data:`LEAD`. It is left alone where this is at the target.
+
+    Args:
+        com: Centre of mass of the character, ``(N, 2)``, in metres.
+        ball: Position of the ball, ``(N, 2)``.
+        velocity: Velocity of the ball, ``(N, 2)``, in m/s.
+        target: Position of the target, ``(N, 2)``.
+
+    Returns:
+        Places, ``(N, 2)``.
+    """
+    ball = ball + LEAD * velocity
+    onward, approach = normalize(target - ball, dim=-1), normalize(ball - com, dim=-1)
+    left = torch.stack([-onward[:, 1], onward[:, 0]], -1)
+    alignment = (approach * onward).sum(-1, keepdim=True)
+    side = -(approach * left).sum(-1, keepdim=True).sign() * (alignment < 0)  # of the ball, if it is in the way
+    place = ball + PUSH * torch.where(alignment > BEHIND, onward, side * left - onward)
+    return torch.where(near(ball, target, SUCCESS_DISTANCE).unsqueeze(-1), com, place)
+
+
+def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
+    """The goal of :class:`.Location`, in the environment of any task.
+
+    Args:
+        env: The environment.
+        place: Places on the ground, ``(N, 2)``, in metres.
+        ids: Simulations, ``(n,)``.
+
+    Returns:
+        Each place relative to the centre of mass in the character's heading frame, with a logarithmic distance,
+        ``(n, 2)``.
+    """
+    return logarithmic(_turned((place - env.com[:, :2])[ids], -env.heading(ids)))
+
+
+def _turned(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Turn horizontal vectors ``(*B, 2)`` to the left by an angle in radians, ``(*B)``."""
+    (x, y), cos, sin = vectors.unbind(-1), angle.cos(), angle.sin()
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)

@@ -1,0 +1,90 @@
+"""Where a character should go next, and what a gate that goes to places does with it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_mcp.envs import Carry, Dribble, Location
+from torchrl_mcp.envs.tasks.waypoints import carry_waypoint, dribble_waypoint
+
+HERE = torch.zeros(1, 2)
+
+
+def at(*place):
+    return torch.tensor([place], dtype=torch.float32)
+
+
+def yes(answer):
+    return torch.tensor([answer])
+
+
+@pytest.mark.parametrize(
+    ("taken", "held", "target", "expected"),
+    [
+        (False, False, (2.0, 5.0), (2.0, 1.0)),  # to the box
+        (True, True, (2.0, 5.0), (0.0, 1.0)),  # a metre of the box's way to the target
+        (True, True, (2.0, 1.4), (0.0, 0.7)),  # the rest of it, and 0.3 m
+        (True, False, (2.0, 1.0), (0.0, 0.0)),  # where the character stands
+    ],
+)
+def test_the_way_of_a_carrier_leads_to_the_box_then_past_the_target_and_ends(taken, held, target, expected):
+    place = carry_waypoint(HERE, at(2.0, 1.0), at(*target), yes(taken), yes(held))
+    torch.testing.assert_close(place, at(*expected))
+
+
+@pytest.mark.parametrize(
+    ("ball", "expected"),
+    [
+        ((3.0, 0.0), (3.5, 0.0)),  # in front, the target beyond it: through the ball
+        ((0.3, 3.0), (-0.2, 3.0)),  # to the left, the target far ahead: behind the ball
+        ((-3.0, 0.1), (-3.5, -0.4)),  # between the ball and its target: around it on the side where the character is
+        ((-3.0, -0.1), (-3.5, 0.4)),
+    ],
+)
+def test_the_way_of_a_dribbler_leads_around_the_ball_and_through_it(ball, expected):
+    far = at(1e6, 0.0)
+    place = dribble_waypoint(HERE, at(*ball), torch.zeros(1, 2), far)
+    torch.testing.assert_close(place, at(*expected), atol=1e-5, rtol=0)
+
+
+def test_a_dribbler_waits_for_a_ball_that_rolls_to_its_target():
+    target = at(5.0, 0.0)
+    for speed, waits in ((0.0, False), (1.0, False), (2.0, True), (3.0, False)):
+        place = dribble_waypoint(HERE, at(3.0, 0.0), at(speed, 0.0), target)
+        assert torch.equal(place, HERE) == waits
+
+
+@pytest.mark.parametrize(("task", "thing"), [(Carry, "box"), (Dribble, "ball")])
+def test_the_goal_ends_with_the_waypoint_as_the_location_task_shows_places(task, thing):
+    env = task("biped", 3, seed=0, num_threads=1, waypoint=True, dtype=torch.float64)
+    plain = task("biped", 3, seed=0, num_threads=1, dtype=torch.float64).reset()["goal"]
+    goal = env.reset()["goal"]
+    assert torch.equal(goal[:, :-2], plain)
+    assert env.goal_layout["waypoint"] == slice(plain.shape[-1], goal.shape[-1])
+    if task is Dribble:
+        return
+    for index in range(3):
+        data = env.simulation.data(index)
+        way = (data.body(thing).xpos - data.subtree_com[1])[:2]
+        forward = data.body("root").xmat.reshape(3, 3)[:2, 0]
+        angle = math.atan2(way[1], way[0]) - math.atan2(forward[1], forward[0])
+        expected = math.log1p(np.linalg.norm(way) / 0.25) * np.array([math.cos(angle), math.sin(angle)])
+        np.testing.assert_allclose(goal[index, -2:], expected, atol=1e-9)
+
+
+def test_a_place_and_a_waypoint_have_the_same_size():
+    location = Location("biped", 1, seed=0, num_threads=1).reset()["goal"]
+    layout = Carry("biped", 1, seed=0, num_threads=1, waypoint=True).goal_layout
+    assert location.shape[-1] == layout["waypoint"].stop - layout["waypoint"].start
+
+
+def test_left_and_right_are_alike():
+    sign, random = torch.tensor([1.0, -1.0]), torch.Generator().manual_seed(0)
+    scene = [torch.randn(50, 2, generator=random) for _ in range(4)]
+    place, mirrored = dribble_waypoint(*scene), dribble_waypoint(*(part * sign for part in scene))
+    torch.testing.assert_close(mirrored, place * sign)
+    env = Dribble("biped", 1, seed=0, num_threads=1, waypoint=True)
+    goal = env.reset()["goal"]
+    torch.testing.assert_close(env.goal_mirror()(goal)[0, -2:], goal[0, -2:] * sign)
