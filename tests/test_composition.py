@@ -176,4 +176,8 @@ def test_policies_are_evaluated_in_the_task_of_the_paper(task):
     cfg = composed(f"task={task}", "stage=transfer")
     found = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
     assert {name: found[name] for name in EVALUATED[task]} == EVALUATED[task]
-    assert found.keys() - EVALUATED[task].keys() <= {"goal_positions", "speed_interval"}  # its own; without effect
+    assert found.keys() - EVALUATED[task].keys() <= {
+        "goal_positions",
+        "waypoint",
+        "speed_interval",
+    }  # its own; without effect
