@@ -98,8 +98,8 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
     folder = tmp_path / "run"
     experiment.train(configure(folder, "autocast=auto", "training.total_frames=128"))
     chosen = word == "bfloat16"
-    first = capsys.readouterr().out.splitlines()[0]
-    assert (f"networks in {word}: " in first) == chosen  # float32 needs no word
+    said = capsys.readouterr().out
+    assert (f"networks in {word}: " in said) == chosen  # float32 needs no word
     origin = json.loads((folder / "origin.json").read_text())
     assert origin["precision"].startswith(f"networks in {word}: ")
     cfg = OmegaConf.load(folder / "config.yaml")
