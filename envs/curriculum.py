@@ -48,6 +48,11 @@ class Curriculum:
                 "reward_weights with discount=1: a success is worth full reward for ever, pass a discount below 1"
             )
 
+    @property
+    def ends_at_success(self) -> bool:
+        """Whether a success ends an episode of carrying or dribbling."""
+        return self.reward_weights is not None and self.discount is not None
+
     @classmethod
     def of(cls, given: "Curriculum | Mapping[str, Any] | None") -> "Curriculum":
         """Return a curriculum, also from its arguments by name, or from None for the task's own episodes.

@@ -213,10 +213,8 @@ class Carry(PDCharacterEnv):
         return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
 
     def terminated(self) -> Tensor:
-        """Whether a success ends the episode, as it does in training with other weights of the reward."""
-        aids = self.curriculum
-        ends = aids.reward_weights is not None and aids.discount is not None
-        return self.success() if ends else super().terminated()
+        """A success, if it ends the episode."""
+        return self.success() if self.curriculum.ends_at_success else super().terminated()
 
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
