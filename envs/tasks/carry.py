@@ -17,7 +17,7 @@ from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
-from torchrl_mcp.envs.tasks.tables import DROP, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
+from torchrl_mcp.envs.tasks.tables import CLEARANCE, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     goal_layout,
@@ -39,7 +39,7 @@ position (3), orientation (4), linear (3) and angular velocity (3)."""
 RESTING_GAP = 0.01
 """Largest distance in metres between box and top at which the box stands on the top."""
 
-RELEASE_GAP = DROP + RESTING_GAP
+RELEASE_GAP = CLEARANCE + RESTING_GAP
 """Largest distance in metres between box and top at which the joint opens, reached at the box's initial height."""
 
 
@@ -52,11 +52,11 @@ class Carry(PDCharacterEnv):
     """A character takes a box from a source table to a target table.
 
     The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
-    to the carrier. The joint opens once the box is over the target, less than 6 cm above it, and does not close again
-    within the episode. *Over* means that the centre of the box is over the top; a box *stands* there if its lowest
-    point is less than 1 cm above it. A box that was knocked off the source cannot be taken. ``box_taken`` (1, bool) is
-    whether the box was taken in this episode, and ``success`` (1, bool) whether it then was let go and stands on the
-    target.
+    to the carrier, and the source sinks by 10 cm. The joint opens once the box is over the target, less than 11 cm
+    above it, and does not close again within the episode. *Over* means that the centre of the box is over the top; a
+    box *stands* there if its lowest point is less than 1 cm above it. A box that was knocked off the source cannot be
+    taken. ``box_taken`` (1, bool) is whether the box was taken in this episode, and ``success`` (1, bool) whether it
+    then was let go and stands on the target.
 
     ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
     angular velocity of the box, in the character's heading frame, with positions relative to the root; ``goal_layout``
@@ -158,6 +158,7 @@ class Carry(PDCharacterEnv):
         self._tables = {name: self.pose(name) for name in ("source", "target")}
         self._vertical, self._gaps = outputs["geom_xmat"][:, model.geom("box").id, 6:], outputs["sensordata"]
         self._joined, self._joint = state["eq_active"][:, 0], state["eq_data"][:, 0, 3:10]
+        self._source_height = state["mocap_pos"][:, 1, 2]
         self.track(object=self._box[0])
         self.make_specs()
 
@@ -172,13 +173,14 @@ class Carry(PDCharacterEnv):
         return {**start, "mocap_pos": tables, "mocap_quat": turns}
 
     def after_step(self, diverged: Tensor) -> None:
-        """Fix the box to a carrier that touches it on the source, and let it go over the target."""
+        """Fix the box to a carrier that touches it on the source, which sinks, and let it go over the target."""
         touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
         closing = self._over(touching, "source", RESTING_GAP)
         opening = self._over(self._joined == 1, "target", RELEASE_GAP)
         if len(closing):
             self._joint[closing] = relative_pose(*(part[closing] for part in (*self._carrier, *self._box)))
             self._joined[closing] = self.episode["taken"][closing] = 1
+            self._source_height[closing] -= CLEARANCE
         self._joined[opening] = 0
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
@@ -269,7 +271,7 @@ class Carry(PDCharacterEnv):
             able = ", ".join(name for name, character in CHARACTERS.items() if character.carrier)
             raise ValueError(f"character={self.character.name!r} has no body to carry a box with: pass one of {able}")
         height = height_of(spec, carrier)
-        add_table(spec, "target", height - HALF_SIZE - DROP, rgba=(0.75, 0.2, 0.15, 1.0))
+        add_table(spec, "target", height - HALF_SIZE - CLEARANCE, rgba=(0.75, 0.2, 0.15, 1.0))
         add_table(spec, "source", height - HALF_SIZE, rgba=(0.3, 0.45, 0.6, 1.0))
         add_box(spec, height)
         add_joint(spec, carrier)

@@ -9,8 +9,11 @@ MASS = 5.0
 HALF_SIZE = 0.15
 TOP_HALF_SIZE = 0.14
 TOP_THICKNESS = 0.03
-DROP = 0.05
-"""Metres by which the target's top is lower than the source's: a box carried at its initial height passes over it."""
+CLEARANCE = 0.1
+"""Metres by which the target's top is lower than the source's, and by which the source sinks once the box is taken.
+
+While its carrier walks, a box dips by as much below its initial height, and would catch on the tops.
+"""
 
 TOP_CONTACT = 2
 """MuJoCo's contact bit of the tops, which only the box shares: for characters, tops would be walls."""

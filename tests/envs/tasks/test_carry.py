@@ -113,6 +113,32 @@ def test_a_box_that_does_not_stand_on_the_source_is_not_taken(ahead):
     assert joined(env) == [0.0, 0.0, 1.0]
 
 
+def test_the_source_sinks_where_the_box_is_taken_until_the_next_episode(ahead):
+    env = make(2, max_episode_steps=3)
+    state = ahead(env, -0.002)
+    state["qpos"][1, -7] = state["mocap_pos"][1, 1, 0] = 3.0
+    carrier = play(env, env.reset(state, set_state=True), 2)
+    sunk = state["mocap_pos"][:, 1, 2] - env.get_state()["mocap_pos"][:, 1, 2]
+    assert sunk.tolist() == pytest.approx([0.1, 0.0])
+    assert carrier["goal"][:, env.goal_layout["source.position"]][:, 2].diff().item() == pytest.approx(0.1, abs=2e-3)
+    env.reset()
+    assert torch.equal(env.get_state()["mocap_pos"][:, :, 2], state["mocap_pos"][:, :, 2])
+
+
+@pytest.mark.parametrize("table", ["source", "target"])
+def test_a_box_in_hand_that_dips_while_its_carrier_walks_passes_over_the_tops(table, ahead):
+    env = make(1)
+    play(env, env.reset(ahead(env, -0.002), set_state=True), 2)
+    data, model = env.simulation.data(0), env.simulation.model
+    data.joint("box").qpos[:2] = data.body(table).xpos[:2]
+    for dip, touching in ((0.0, 0), (0.09, 0), (0.11, 1)):
+        data.joint("box").qpos[2] = env.get_state()["qpos"][0, -5] - dip
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        tops = set(np.flatnonzero(model.geom_bodyid == model.body(table).id))
+        assert any(tops & {*contact} for contact in data.contact.geom.tolist()) == touching
+
+
 def test_the_joint_closes_without_a_jump(ahead):
     env, free = make(1), make(1)
     state = ahead(env, -0.001)
@@ -128,7 +154,7 @@ def test_the_joint_closes_without_a_jump(ahead):
     play(env, one, 1)
     play(free, other, 1)
     moved = env.simulation.state["qpos"] - free.simulation.state["qpos"]
-    assert moved.abs().max() < 1e-3
+    assert moved.abs().max() < 4e-3  # its carrier yields to its weight, which the source bore; a free fall is 5 mm
     for _ in range(20):
         play(env, one, 1)
         now, turned = held_pose(env)
