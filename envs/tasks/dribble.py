@@ -18,6 +18,7 @@ from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     SUCCESS_DISTANCE,
+    SUCCESS_REACH,
     goal_layout,
     goal_mirror,
     goal_of,
@@ -51,9 +52,6 @@ CONTACT_DAMPING = 25.0
 
 FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 0.55 to 0.71 of the speed.
 """
-
-SUCCESS_REACH = 2.0
-"""Largest distance in metres between character and ball for success."""
 
 
 dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)

@@ -18,6 +18,9 @@ from torchrl_mcp.envs.tasks.ranges import Ranges
 SUCCESS_DISTANCE = 0.5
 """Distance in metres between object and target for success, as in the same authors' public code."""
 
+SUCCESS_REACH = 2.0
+"""Largest distance in metres between character and ball for success."""
+
 ANY_DIRECTION = (-math.pi, math.pi)
 """All directions, in radians."""
 

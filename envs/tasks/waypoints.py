@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
-from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, logarithmic, near
+from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, SUCCESS_REACH, logarithmic, near
 
 STRIDE = 1.0
 """Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
@@ -47,7 +47,8 @@ def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held
 def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor) -> Tensor:
     """Around the ball until the character is behind it, then through it, then where the character stands.
 
-    The ball is where it will be after :data:`LEAD`. It is left alone where this is at the target.
+    The ball is where it will be after :data:`LEAD`. It is left alone where this is at the target, and the character
+    then stands within :data:`SUCCESS_REACH`.
 
     Args:
         com: Centre of mass of the character, ``(N, 2)``, in metres.
@@ -58,13 +59,14 @@ def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor
     Returns:
         Places, ``(N, 2)``.
     """
-    ball = ball + LEAD * velocity
+    now, ball = ball, ball + LEAD * velocity
     onward, approach = normalize(target - ball, dim=-1), normalize(ball - com, dim=-1)
     left = torch.stack([-onward[:, 1], onward[:, 0]], -1)
     alignment = (approach * onward).sum(-1, keepdim=True)
     side = -(approach * left).sum(-1, keepdim=True).sign() * (alignment < 0)  # of the ball, if it is in the way
     place = ball + PUSH * torch.where(alignment > BEHIND, onward, side * left - onward)
-    return torch.where(near(ball, target, SUCCESS_DISTANCE).unsqueeze(-1), com, place)
+    standing = torch.where(near(com, now, SUCCESS_REACH).unsqueeze(-1), com, now)
+    return torch.where(near(ball, target, SUCCESS_DISTANCE).unsqueeze(-1), standing, place)
 
 
 def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:

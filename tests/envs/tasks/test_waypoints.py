@@ -50,10 +50,16 @@ def test_the_way_of_a_dribbler_leads_around_the_ball_and_through_it(ball, expect
 
 
 def test_a_dribbler_waits_for_a_ball_that_rolls_to_its_target():
-    target = at(5.0, 0.0)
+    target = at(3.9, 0.0)
     for speed, waits in ((0.0, False), (1.0, False), (2.0, True), (3.0, False)):
-        place = dribble_waypoint(HERE, at(3.0, 0.0), at(speed, 0.0), target)
+        place = dribble_waypoint(HERE, at(1.9, 0.0), at(speed, 0.0), target)
         assert torch.equal(place, HERE) == waits
+
+
+def test_a_dribbler_goes_to_a_ball_at_its_target_until_it_is_near():
+    for distance, place in ((2.1, at(2.1, 0.0)), (1.9, HERE)):
+        ball = at(distance, 0.0)
+        assert torch.equal(dribble_waypoint(HERE, ball, torch.zeros(1, 2), ball + 0.1), place)
 
 
 @pytest.mark.parametrize(("task", "thing"), [(Carry, "box"), (Dribble, "ball")])
