@@ -7,7 +7,7 @@ from torch.distributions import Independent, Normal
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.methods.actor import Sizes
-from torchrl_mcp.methods.latent_space import LATENT, NOISE, latent_actor, latent_parts
+from torchrl_mcp.methods.latent_space import LATENT, NOISE, latent_actor, latent_parts, latents_actor
 from torchrl_mcp.modules import GaussianPolicy, GoalEncoder, StateGoalEncoder
 
 S, G, A, L = 6, 2, 3, 4
@@ -108,3 +108,28 @@ def test_a_frozen_decoder_passes_gradients_on_to_the_encoder():
 def test_a_latent_space_without_dimensions_is_refused():
     with pytest.raises(ValueError, match="latent_dim must be at least 1, got 0"):
         latent_parts(Sizes(S, G, A), encoder=GoalEncoder, decoder=GaussianPolicy, latent_dim=0)
+
+
+def test_exploration_over_the_latent_variable_draws_it_and_plays_the_decoder_s_mean():
+    frozen = ["decoder", "observation_normaliser"]
+    parts = make(frozen=frozen)[1]
+    actor = latents_actor(parts, frozen=frozen)
+    assert (actor.sampled, actor.log_prob) == ("latents", "latents_log_prob")
+    with torch.no_grad():
+        stored = actor.policy(states(50))
+        observation, goal = (parts[f"{key}_normaliser"](stored[key]) for key in ("observation", "goal"))
+        loc, scale = parts["encoder"](observation, goal)
+    assert torch.equal(stored["action"], parts["decoder"](observation, stored["latents"])[0])
+    score = Independent(Normal(loc, scale), 1).log_prob(stored["latents"])
+    torch.testing.assert_close(stored["latents_log_prob"], score)
+    actor.trained.get_dist(stored).log_prob(stored["latents"]).sum().backward()
+    assert all(parameter.grad.abs().max() > 0 for parameter in parts["encoder"].parameters())
+    assert all(parameter.grad is None for parameter in parts["decoder"].parameters())
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        played = actor.policy(states(10))
+    assert torch.equal(played["latents"], played["latent", "loc"])
+
+
+def test_exploration_over_the_latent_variable_refuses_a_decoder_that_is_not_frozen():
+    with pytest.raises(ValueError, match=r"decoder.*transfer\.freeze.*exploration=action"):
+        latents_actor(make()[1])

@@ -11,6 +11,7 @@ policies at the same noise and differentiates through :math:`w`, which trains th
 | ``latent`` / ``noise`` | :math:`\epsilon` | ``(*B, L)`` |
 | ``latent`` / ``loc``, ``scale`` | mean and standard deviation of the encoder | ``(*B, L)`` |
 | ``latent`` / ``sample`` | latent variable :math:`w`, the decoder's view of the goal | ``(*B, L)`` |
+| ``latents`` | the same, where it is the random variable of the policy gradient | ``(*B, L)`` |
 
 Reference:
     Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
@@ -20,7 +21,12 @@ Reference:
 from collections.abc import Callable, Collection
 
 import torch
-from tensordict.nn import InteractionType, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
@@ -76,6 +82,34 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
     )
     policy = ProbabilisticTensorDictSequential(*encoder, noise, *decoder)
     return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
+
+
+def latents_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor:
+    r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
+
+    The policy gradient uses the density of the latent variable, as :func:`~torchrl_mcp.methods.mcp.weights_actor` uses
+    that of the weights. So the decoder has no gradient and must be frozen.
+
+    Args:
+        parts: Made by :func:`latent_parts`.
+        frozen: Names of the parts that do not change in training.
+
+    Raises:
+        ValueError: If the decoder is not frozen.
+    """
+    if "decoder" not in frozen:
+        raise ValueError(
+            "exploration over the latent variable trains the encoder alone: use it with stage=transfer and keep "
+            "'decoder' in transfer.freeze, or take exploration=action"
+        )
+    encoder = (
+        normalise_inputs(parts),
+        TensorDictModule(parts["encoder"], in_keys=[STATE, GOAL], out_keys=list(ENCODING)),
+        sampler("latents", IndependentNormal, loc=ENCODING[0], scale=ENCODING[1]),
+    )
+    decoder = TensorDictModule(parts["decoder"], in_keys=[STATE, "latents"], out_keys=["action", "_"])
+    policy, trained = TensorDictSequential(*encoder, decoder), ProbabilisticTensorDictSequential(*encoder)
+    return Actor(policy, trained, stored=("latents",), sampled="latents")
 
 
 def latent_noise(loc: Tensor) -> Tensor:
