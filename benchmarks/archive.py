@@ -114,7 +114,7 @@ def label(cell: Cell) -> str:
     """
     standard = cell.runs[0].standard
     others = [
-        f"pre-trained {value / 1e6:g} M" if name == "budget.pretrain" else f"{name}={value}"
+        f"pre-trained {value / 1e6:g} M" if name.startswith("budget.pretrain") else f"{name}={value}"
         for name, value in cell.settings.items()
         if name not in ("preset", "total_frames") and value != standard.get(name, DEFAULT)
     ]

@@ -127,7 +127,7 @@ def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     def steps(job):
         return job.config["training"]["total_frames"] + (steps(jobs[job.needs]) if job.needs else 0)
 
-    assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 11_000_000)
+    assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 5_500_000)
 
 
 def test_pretraining_ignores_how_much_the_gate_of_transfer_explores(tmp_path):
@@ -146,7 +146,7 @@ def test_a_longer_transfer_shares_the_pretraining_of_a_shorter_one(tmp_path):
         return jobs_of("benchmark=table2", f"run_root={tmp_path}", *arguments)
 
     source, shorter = jobs()
-    same, longer = jobs("budget.transfer=2000000", "budget.scratch=5000000")
+    same, longer = jobs("budget.transfer.dribble=2000000", "budget.scratch.dribble=7000000")
     assert (same.folder, same.config) == (source.folder, source.config)
     assert longer.folder != shorter.folder
     assert (longer.needs, longer.config["training"]["total_frames"]) == (source.folder, 2_000_000)
