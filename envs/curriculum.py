@@ -25,8 +25,7 @@ class Curriculum:
         random_first_length: Shorten the first episodes by different lengths, evenly spread over the simulations, so
             that these are at different times of their episodes: otherwise a batch of short trajectories would cover a
             single time.
-        discount: Discount factor of the learner, for the worth of a success, which ends the episode; None lets the
-            episode go on.
+        discount: Discount factor of the learner, for the worth of a success, which ends the episode.
 
     Raises:
         ValueError: If the discount is out of range.
@@ -38,10 +37,10 @@ class Curriculum:
     reward_weights: Sequence[float] | None = None
     target_distance_power: float = 1
     random_first_length: bool = False
-    discount: float | None = 0.99
+    discount: float = 0.99
 
     def __post_init__(self) -> None:
-        if self.discount is not None and not 0 < self.discount <= 1:
+        if not 0 < self.discount <= 1:
             raise ValueError(f"discount={self.discount} is out of range: pass the learner's, above 0 and at most 1")
         if self.reward_weights is not None and self.discount == 1:
             raise ValueError(
@@ -51,7 +50,7 @@ class Curriculum:
     @property
     def ends_at_success(self) -> bool:
         """Whether a success ends an episode of carrying or dribbling."""
-        return self.reward_weights is not None and self.discount is not None
+        return self.reward_weights is not None
 
     @classmethod
     def of(cls, given: "Curriculum | Mapping[str, Any] | None") -> "Curriculum":

@@ -71,7 +71,7 @@ class Carry(PDCharacterEnv):
     box at rest on the target has a printed reward of at most 0.73; with the second variant it is 1.
 
     With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -208,11 +208,11 @@ class Carry(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
+        aids, weights = self.curriculum, self.curriculum.reward_weights
         assert weights is not None
         power, speed = aids.target_distance_power, self.speed
-        reward = carry_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
-        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
+        reward = carry_reward(*self._motion(), weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), weights=weights, speed=speed, discount=aids.discount)
 
     def terminated(self) -> Tensor:
         """A success, if it ends the episode."""

@@ -73,7 +73,7 @@ class Dribble(PDCharacterEnv):
 
     The variants of the reward are those of :class:`~torchrl_mcp.envs.Carry`: a ball at rest at the target has a printed
     reward of at most 0.73. With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode unless ``discount`` is None.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -182,11 +182,11 @@ class Dribble(PDCharacterEnv):
 
     def training_reward(self) -> Tensor:
         """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        aids, weights, motion = self.curriculum, self.curriculum.reward_weights, self._motion()
+        aids, weights = self.curriculum, self.curriculum.reward_weights
         assert weights is not None
         power, speed = aids.target_distance_power, self.speed
-        reward = dribble_reward(*motion, weights=weights, speed=speed, target_distance_power=power)
-        return training_reward(reward, self.success(), motion[1], weights=weights, speed=speed, discount=aids.discount)
+        reward = dribble_reward(*self._motion(), weights=weights, speed=speed, target_distance_power=power)
+        return training_reward(reward, self.success(), weights=weights, speed=speed, discount=aids.discount)
 
     def terminated(self) -> Tensor:
         """A success, if it ends the episode."""

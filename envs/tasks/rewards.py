@@ -196,39 +196,32 @@ def idle_reward(weights: Sequence[float], speed: float) -> float:
 def training_reward(
     reward: Tensor,
     success: Tensor,
-    com_velocity: Tensor,
     *,
     weights: Sequence[float],
     speed: float,
-    discount: float | None,
+    discount: float,
 ) -> Tensor:
     r"""Reward for training to carry and dribble: about zero for standing still, and greatest for a success.
 
     .. math::
         r' = \begin{cases}
-            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success, if it ends the episode} \\
-            \sum_i w_i \frac{1 + \exp(-4 \|v_{com}\|^2)}{2} - r_{idle} & \text{while successful, if it does not} \\
+            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success, which ends the episode} \\
             r - r_{idle} & \text{else}
         \end{cases}
 
-    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success
-    that ends the episode is worth the discounted return of all terms being 1 for ever: otherwise a character that walks
-    on knocks the box off the target, and a success is worth little. A gate that can stand already learns to do so at
-    the target if the episode goes on.
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success is
+    worth the discounted return of all terms being 1 for ever: otherwise a character that walks on knocks the box off
+    the target, and a success is worth little.
 
     Args:
         reward: :func:`transport_reward` with these weights, shape ``(*B)``.
         success: Whether the object is at its target, shape ``(*B)``, bool.
-        com_velocity: Velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.
         weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
         speed: Target speed :math:`\hat{v}`, in m/s, for the :func:`idle_reward`.
-        discount: Discount factor :math:`\gamma` of the learner, below 1; None if the episode goes on after a success.
+        discount: Discount factor :math:`\gamma` of the learner, below 1.
 
     Returns:
         Reward, shape ``(*B)``.
     """
-    full, idle = sum(weights), idle_reward(weights, speed)
-    if discount is not None:
-        return (reward - idle).masked_fill(success, (full - idle) / (1 - discount))
-    standing = full * (1 + velocity_reward(com_velocity, torch.zeros_like(com_velocity))) / 2
-    return reward.where(~success, standing) - idle
+    idle = idle_reward(weights, speed)
+    return (reward - idle).masked_fill(success, (sum(weights) - idle) / (1 - discount))

@@ -70,18 +70,6 @@ def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
     assert others > 0
 
 
-def test_without_a_discount_the_episode_goes_on_and_who_stands_earns_most():
-    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
-    full, idle = sum(WEIGHTS), 0.6 * math.exp(-1.5) + 1.0 * math.exp(-1)
-    env = make(Dribble, curriculum={**WEIGHED, "discount": None}, **there)
-    for state, before, (com, *_) in outcomes(env, 3):
-        squared_speed = ((com - before[0]) ** 2).sum(-1) * 900
-        assert state["success"].all()
-        assert not state["done"].any()
-        expected = full * (1 + np.exp(-4 * squared_speed)) / 2 - idle
-        np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
-
-
 def test_full_reward_for_ever_needs_a_discount():
     with pytest.raises(ValueError, match=r"reward_weights with discount=1: .* pass a discount below 1"):
         Curriculum(reward_weights=WEIGHTS, discount=1)

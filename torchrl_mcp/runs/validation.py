@@ -94,10 +94,9 @@ NAMES_BY_RULE: dict[Rule, str] = {
         target_distance_power reset_noise_scale forward_weight healthy_weight control_weight contact_weight
     """,
     DISCOUNT: "gamma",
-    SHARE.or_null(): "discount",
     PROBABILITY: "terminations.initial",
     SHARE: """
-        lmbda epsilon momentum initial_states.rest
+        lmbda discount epsilon momentum initial_states.rest
         initial_states.motions motion_starts
     """,
     FLAG: """
