@@ -14,7 +14,7 @@ from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.rotations import about_z, inverse, multiply, rotate
+from torchrl_mcp.envs.rotations import about_z, heading, inverse, multiply, rotate
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.envs.tasks.tables import CLEARANCE, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
@@ -182,6 +182,18 @@ class Carry(PDCharacterEnv):
             self._joined[closing] = self.episode["taken"][closing] = 1
             self._source_height[closing] -= CLEARANCE
         self._joined[opening] = 0
+
+    def offer(self, index: int) -> None:
+        """Lift a box that was let go onto the source, at its place in a simulation, so that it can be taken again."""
+        if not self.episode["taken"][index] or self._joined[index]:
+            return
+        state, height = self.simulation.state, float(self._marks[1, 2])
+        place = state["qpos"][index, -7:-5].clone()
+        turn = about_z(heading(state["qpos"][index, -4:]))
+        state["mocap_pos"][index, 1] = torch.cat([place, place.new_tensor([height])])
+        state["mocap_quat"][index, 1] = state["qpos"][index, -4:] = turn
+        state["qpos"][index, -5], state["qvel"][index, -6:] = height + HALF_SIZE, 0.0
+        self.episode["taken"][index] = 0
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and where it sees tables and box."""

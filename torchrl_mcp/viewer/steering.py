@@ -132,8 +132,13 @@ class Steering:
             self.place = x, y  # where it stands at a speed of 0
 
     def put(self, place: Sequence[float] | np.ndarray) -> None:
-        """Place the target of the character, the ball or the box on the ground, x and y in metres."""
+        """Place the target of the character, the ball or the box on the ground, x and y in metres.
+
+        A box that was put down is taken again.
+        """
         if self.has_place:
+            if isinstance(self.player.env, Carry):
+                self.player.env.offer(0)
             self.place, self.direction, self.speed = (float(place[0]), float(place[1])), None, None
 
     def pin(self, primitive: int, weight: float) -> None:

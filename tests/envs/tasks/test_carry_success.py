@@ -109,3 +109,23 @@ def test_a_box_that_was_put_down_is_not_taken_again_in_the_same_episode(over_the
     state["taken"][1] = 0
     play(env, env.reset(state, set_state=True), 1)
     assert joined(env) == [0.0, 1.0]
+
+
+def test_a_box_that_was_put_down_is_offered_on_the_source_and_taken_again(over_the_target):
+    env = make(2)
+    carrier = play(env, env.reset(over_the_target(env, 0.05), set_state=True), 20)
+    assert carrier["success"].all()
+    before = env.get_state()
+    env.offer(0)
+    state = env.get_state()
+    assert (state[1] == before[1]).all()
+    assert torch.equal(state["qpos"][0, :-5], before["qpos"][0, :-5])
+    source = state["mocap_pos"][0, 1]
+    torch.testing.assert_close(source[:2], before["qpos"][0, -7:-5])
+    assert state["qpos"][0, -5] - source[2] == pytest.approx(HALF_SIZE)
+    assert source[2] - state["mocap_pos"][0, 0, 2] > 0.0
+    state["qpos"][0, -7] -= 0.01  # against the torso
+    play(env, env.reset(state, set_state=True), 1)
+    assert joined(env) == [1.0, 0.0]
+    env.offer(0)  # in hand: nothing to offer
+    assert joined(env) == [1.0, 0.0]
