@@ -6,9 +6,10 @@
 
 Everything lands in ``results/table2``. ``runs.tar.xz`` has the run folders without checkpoints, and of their metrics
 only the columns of learning curves; ``torchrl-mcp-report`` reads it unpacked. ``table.md`` is Table 2 with our results,
-``summary.md`` its short form for the README, and ``table_2.png`` the picture of the report. Each row has a table,
-``TASK_CHARACTER.md``, and learning curves; ``imitation_CHARACTER`` and ``holdout_ant_pretrain`` have those of
-pre-training. ``runs.csv`` has the command, the commit and the machine of every run.
+``summary.md`` its short form for the README, ``table_2.png`` the picture of the report, and ``over_rows.png`` has
+interquartile means over the rows and the probability that MCP is ahead. Each row has a table, ``TASK_CHARACTER.md``,
+and learning curves; ``imitation_CHARACTER`` and ``holdout_ant_pretrain`` have those of pre-training. ``runs.csv`` has
+the command, the commit and the machine of every run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +21,7 @@ from archive import EMPTY, archived, is_short, score, share, write_tables
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import Cell
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
-from torchrl_mcp.report.table_2 import average, compared, draw_table_2
+from torchrl_mcp.report.table_2 import average, compared, draw_over_rows, draw_table_2
 from torchrl_mcp.runs.tables import text_table
 
 RESULTS = Path(__file__).resolve().parent / "results" / "table2"
@@ -34,8 +35,9 @@ def main() -> None:
             table = text_table(rows, markdown=True)
             (output / f"{name}.md").write_text(table + "\n")
             print(table, end="\n\n")
-        if picture := draw_table_2(found):
-            save_figure(picture, output / "table_2")
+        for name, picture in (("table_2", draw_table_2(found)), ("over_rows", draw_over_rows(found))):
+            if picture:
+                save_figure(picture, output / name)
         write_tables(found, output)
 
 

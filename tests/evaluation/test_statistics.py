@@ -2,8 +2,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import mannwhitneyu
 
-from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, probability_of_improvement
 
 
 def test_the_mean_is_the_mean_and_the_deviation_that_of_a_sample():
@@ -57,3 +58,19 @@ def test_a_task_of_a_single_seed_leaves_nothing_to_resample():
 def test_missing_values_are_an_error(strata):
     with pytest.raises(ValueError, match="leave out what was not evaluated"):
         interquartile_mean(strata)
+
+
+def test_the_probability_of_improvement_is_the_mean_over_tasks_of_mann_whitney_s():
+    draw = np.random.default_rng(0).normal
+    pairs = [(draw(0.3, size=4), draw(size=6)), (draw(size=3), draw(1.0, size=3)), ([1.0, 2.0], [1.0, 3.0])]
+    expected = [mannwhitneyu(x, y).statistic / (len(x) * len(y)) for x, y in pairs]
+    assert probability_of_improvement(pairs).value == pytest.approx(np.mean(expected))
+
+
+def test_the_probability_of_improvement_has_an_interval_within_each_task():
+    sure = probability_of_improvement([([0.9, 0.8, 0.7], [0.1, 0.2, 0.3]), ([5.0, 6.0], [-1.0, 1.0])])
+    assert (sure.low, sure.value, sure.high) == (1.0, 1.0, 1.0)
+    open_ = probability_of_improvement([([0.1, 0.5, 0.9], [0.2, 0.4, 0.8])])
+    assert open_.value == pytest.approx(5 / 9)
+    assert 0 <= open_.low < 5 / 9 < open_.high <= 1
+    assert math.isnan(probability_of_improvement([([0.1], [0.2, 0.3])]).low)

@@ -15,7 +15,7 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
-from torchrl_mcp.report.table_2 import describe, draw_table_2
+from torchrl_mcp.report.table_2 import describe, draw_over_rows, draw_table_2
 
 PUBLISHED = Path(__file__).parents[2] / "benchmarks/results/table2"
 ROWS = [
@@ -131,3 +131,24 @@ def test_without_a_row_of_table_2_there_is_no_picture(write_run, tmp_path):
     write_run("pretraining", task="imitation", stage="pretrain", score=0.5)
     write_run("unfinished", progress=0.5)
     assert drawn(tmp_path) is None
+
+
+def test_methods_are_compared_over_the_rows_that_they_share(run_writers, tmp_path):
+    write_run, write_mcp = run_writers(tmp_path)
+    scores = {"heading": ((0.9, 0.8), (0.85, 0.7)), "dribble": ((0.3, 0.4), (0.1, 0.2))}
+    for task, (ours, others) in scores.items():
+        for seed, (mine, other) in enumerate(zip(ours, others, strict=True)):
+            write_mcp(f"mcp-{task}{seed}", task=task, seed=seed, score=mine)
+            write_run(f"scratch-{task}{seed}", task=task, seed=seed, score=other)
+    left, right = draw_over_rows(cells(find_runs([tmp_path])[0])).axes
+    means = [line.get_xdata()[0] for line in left.lines if len(line.get_xdata()) == 1]
+    assert dict(zip((label.get_text() for label in left.get_yticklabels()), means, strict=True)) == pytest.approx(
+        {"Scratch": (0.2 + 0.7) / 2, "MCP": (0.4 + 0.8) / 2}  # the middle half of each
+    )
+    assert [label.get_text() for label in right.get_yticklabels()] == ["Scratch"]
+    assert right.lines[1].get_xdata() == pytest.approx([(3 / 4 + 1) / 2])
+
+
+def test_without_another_method_nothing_is_compared(run_writers, tmp_path):
+    run_writers(tmp_path)[1]("mcp", score=0.5)
+    assert draw_over_rows(cells(find_runs([tmp_path])[0])) is None

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def mean(values: Sequence[float]) -> Estimate:
     Raises:
         ValueError: If there is no value.
     """
-    return _estimate([values], np.mean)
+    return _estimate([values], _pooled(np.mean))
 
 
 def deviation(values: Sequence[float]) -> float:
@@ -58,7 +59,31 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
     """
     from scipy.stats import trim_mean  # slow to import
 
-    return _estimate(strata, lambda values, axis: trim_mean(values, 0.25, axis=axis))
+    return _estimate(strata, _pooled(partial(trim_mean, proportiontocut=0.25)))
+
+
+def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Estimate:
+    """Return how probable it is that a run of one method is ahead of a run of another, on average over tasks.
+
+    Equal values count half. The bootstrap interval resamples within each task and method.
+
+    Args:
+        pairs: By task, values of the first and of the second method, one per seed.
+
+    Raises:
+        ValueError: If there is no task, or a task without a value.
+
+    Reference:
+        Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", 2021,
+        https://arxiv.org/abs/2108.13264
+    """
+
+    def ahead(*samples: np.ndarray, axis: int) -> np.ndarray:
+        tasks = zip(samples[::2], samples[1::2], strict=True)
+        signs = [np.sign(x[..., :, None] - y[..., None, :]).mean((-2, -1)) for x, y in tasks]
+        return np.asarray(np.mean(signs, axis=0) / 2 + 0.5)
+
+    return _estimate([values for pair in pairs for values in pair], ahead)
 
 
 def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[str, ...] = ()) -> dict[str, float]:
@@ -68,17 +93,22 @@ def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[s
     return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
 
 
+def _pooled(statistic: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """Return the statistic of all samples together."""
+    return lambda *samples, axis: statistic(np.concatenate(samples, axis=axis), axis=axis)
+
+
 def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray]) -> Estimate:
     from scipy.stats import bootstrap  # slow to import
 
     if not strata or not all(len(values) for values in strata):
         raise ValueError(f"values={list(map(list, strata))} hold an empty list: leave out what was not evaluated")
-    value = float(statistic(np.concatenate(strata), axis=0))
+    value = float(statistic(*map(np.asarray, strata), axis=-1))
     if any(len(values) < 2 for values in strata):
         return Estimate(value)
     interval = bootstrap(
         strata,
-        lambda *samples, axis: statistic(np.concatenate(samples, axis=axis), axis=axis),
+        statistic,
         vectorized=True,
         method="percentile",
         confidence_level=CONFIDENCE,

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
+from torchrl_mcp.evaluation.statistics import Estimate, interquartile_mean, probability_of_improvement
 from torchrl_mcp.report.comparison import Cell, methods
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
 
@@ -93,6 +94,51 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
     axes.set_xticks([0.0, 0.5, 1.0])
     axes.grid(axis="x", color="#EEEEEE")
     axes.set_axisbelow(True)
+    bare(axes)
+
+
+def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
+    """Draw each method's interquartile mean, and how probable it is that a run of MCP is ahead of one of the method.
+
+    Means are over the rows in which every method was run, the probability is over those that both have. Lines are 95 %
+    bootstrap intervals, where every row has two seeds or more.
+
+    Args:
+        cells: Cells of any task and stage.
+
+    Returns:
+        The figure, or None if MCP and another method share no row.
+    """
+    rows = [found for place in PLACES if "mcp" in (found := compared(cells, place)) and len(found) > 1]
+    if not rows:
+        return None
+    named = methods(cell for found in rows for cell in found.values())
+    shared = [found for found in rows if found.keys() == named.keys()]
+    others = [method for method in named if method != "mcp"]
+    means = {name: interquartile_mean([found[name].returns() for found in shared]) for name in named if shared}
+    ahead = {
+        name: probability_of_improvement([(f["mcp"].returns(), f[name].returns()) for f in rows if name in f])
+        for name in others
+    }
+    figure = new_figure(7.5, 0.9 + 0.27 * len(named))
+    left, right = figure.subplots(1, 2)
+    titles = {name: TITLES.get(name, title) for name, title in named.items()}
+    draw_estimates(left, means, titles, f"interquartile mean over {len(shared)} rows")
+    draw_estimates(right, ahead, titles, "probability that MCP is ahead")
+    right.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
+    return figure
+
+
+def draw_estimates(axes: Axes, estimates: Mapping[str, Estimate], titles: Mapping[str, str], label: str) -> None:
+    """Draw numbers with their intervals, one below the other."""
+    for position, estimate in enumerate(estimates.values()):
+        axes.plot([estimate.low, estimate.high], [position] * 2, color=COLOURS[0])
+        axes.plot(estimate.value, position, "o", color=COLOURS[0], markersize=4)
+    axes.set_yticks(range(len(estimates)), [titles[name] for name in estimates])
+    axes.set_ylim(len(estimates) - 0.5, -0.5)
+    axes.set_xlim(0.0, 1.02)
+    axes.grid(axis="x", color="#EEEEEE")
+    axes.set_xlabel(label, fontsize=9)
     bare(axes)
 
 
