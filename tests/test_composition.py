@@ -124,16 +124,19 @@ def test_no_tuned_setting_enters_the_paper_s(task, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_gates_over_products_explore_over_weights_unless_the_paper_s_settings_are_asked_for(method):
+def test_products_and_latent_spaces_explore_over_weights_unless_the_paper_s_settings_are_asked_for(method):
     explored = {
         (stage, preset): composed("task=holdout", f"method={method}", f"stage={stage}", f"preset={preset}")
         for stage in STAGES
         for preset in ("fast", "paper")
     }
-    over_weights = {key for key, cfg in explored.items() if cfg.actor._target_.endswith("weights_actor")}
-    assert over_weights == ({("transfer", "fast")} if method == "mcp" else set())
+    over_weights = {
+        key for key, cfg in explored.items() if cfg.actor._target_.endswith(("weights_actor", "latents_actor"))
+    }
+    explores = method in ("mcp", "latent_space")
+    assert over_weights == ({("transfer", "fast")} if explores else set())
     bound = explored["transfer", "fast"].objective.loss.get("bound_coeff", 10.0)
-    assert bound == (0.0 if method == "mcp" else 10.0)
+    assert bound == (0.0 if explores else 10.0)
 
 
 SHARED = ["observation_normaliser"]

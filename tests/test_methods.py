@@ -30,7 +30,7 @@ FILES = sorted((Path(conf.__file__).parent / "method").glob("*.yaml"))
 CASES = {file.stem: (file.stem, place(file)) for file in FILES}
 CASES["finetune to the same goal"] = ("finetune", ANT)
 CASES["mcp over weights"] = ("mcp", (ANT[0], [*ANT[1], "exploration=weights"]))
-CASES["latent_space over its variable"] = ("latent_space", (ANT[0], [*ANT[1], "exploration=weights"]))
+CASES["latent_space over actions"] = ("latent_space", (ANT[0], [*ANT[1], "exploration=action"]))
 
 SMALL = [
     "training.frames_per_batch=64",
