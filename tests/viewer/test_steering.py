@@ -112,6 +112,20 @@ def test_a_target_is_where_it_is_put(task):
     np.testing.assert_allclose(root + turned @ away, [1.5, -2.5], atol=1e-5)
 
 
+def test_a_click_sends_a_carrier_for_the_box_that_it_put_down():
+    steering = idle(Carry)
+    env = steering.player.env
+    steering.put((1.5, -2.5))
+    assert env.get_state()["mocap_pos"][0, 1].tolist() == env.simulation.data(0).body("source").xpos.tolist()
+    env.episode["taken"][0] = 1
+    box = env.simulation.data(0).body("box").xpos[:2].tolist()
+    steering.put((0.5, 2.5))
+    steering.step()
+    assert env.episode["taken"][0] == 0
+    assert env.simulation.data(0).body("source").xpos[:2].tolist() == pytest.approx(box)
+    assert env.simulation.data(0).body("target").xpos[:2].tolist() == [0.5, 2.5]
+
+
 def test_a_character_is_sent_to_a_place_and_stops_where_it_is():
     steering = idle(Location, target_intervals=(0.1, 0.1))
     env = steering.player.env
