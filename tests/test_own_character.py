@@ -1,5 +1,6 @@
 """A body from a file becomes a character that trains: Gymnasium's humanoid, and the tutorial on robots, in small."""
 
+import glob
 import re
 import shlex
 import shutil
@@ -53,7 +54,8 @@ def follow(text, folder, names):
             forget(names)  # each command has a process of its own
             patch.setattr(sys, "path", list(path))
             smaller = "--seconds 0.2" if " render " in step["line"] else SMALLER.get(program, "")
-            patch.setattr(sys, "argv", shlex.split(f"{step['line']} {smaller}"))
+            words = shlex.split(f"{step['line']} {smaller}")
+            patch.setattr(sys, "argv", [name for word in words for name in sorted(glob.glob(word)) or [word]])
             try:
                 PROGRAMS[program].main()
                 status = 0
