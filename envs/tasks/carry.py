@@ -184,7 +184,11 @@ class Carry(PDCharacterEnv):
         self._joined[opening] = 0
 
     def offer(self, index: int) -> None:
-        """Lift a box that was let go onto the source, at its place in a simulation, so that it can be taken again."""
+        """Lift a box that was let go onto the source, where it lies, so that it can be taken again.
+
+        Args:
+            index: The simulation. Nothing changes if its box is held or was never taken.
+        """
         if not self.episode["taken"][index] or self._joined[index]:
             return
         state, height = self.simulation.state, float(self._marks[1, 2])

@@ -13,7 +13,7 @@ the primitives are frozen, the exploration acts on the gate, or noise enters bef
 | ``action`` | input of the environment | ``(*B, A)`` |
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -96,6 +96,24 @@ def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
         TensorDictModule(parts["observation_normaliser"], in_keys=["observation"], out_keys=[STATE]),
         TensorDictModule(parts["goal_normaliser"], in_keys=["goal"], out_keys=[GOAL]),
     )
+
+
+def require_frozen(part: str, frozen: Collection[str], *, over: str) -> None:
+    """Check that exploration over an input of a part, which gives the part no gradient, does not have to train it.
+
+    Args:
+        part: Name of the part.
+        frozen: Names of the parts that do not change in training.
+        over: What is sampled instead of the action.
+
+    Raises:
+        ValueError: If the part is not frozen.
+    """
+    if part not in frozen:
+        raise ValueError(
+            f"exploration over {over} does not train {part!r}: use it with stage=transfer and keep {part!r} in "
+            "transfer.freeze, or take exploration=action"
+        )
 
 
 def sampler(

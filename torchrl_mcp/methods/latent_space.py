@@ -31,7 +31,17 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.actor import (
+    GOAL,
+    STATE,
+    Actor,
+    Explorer,
+    Sizes,
+    input_normalisers,
+    normalise_inputs,
+    require_frozen,
+    sampler,
+)
 
 NOISE = ("latent", "noise")
 ENCODING = (("latent", "loc"), ("latent", "scale"))
@@ -97,11 +107,7 @@ def latents_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Acto
     Raises:
         ValueError: If the decoder is not frozen.
     """
-    if "decoder" not in frozen:
-        raise ValueError(
-            "exploration over the latent variable trains the encoder alone: use it with stage=transfer and keep "
-            "'decoder' in transfer.freeze, or take exploration=action"
-        )
+    require_frozen("decoder", frozen, over="the latent variable")
     encoder = (
         normalise_inputs(parts),
         TensorDictModule(parts["encoder"], in_keys=[STATE, GOAL], out_keys=list(ENCODING)),

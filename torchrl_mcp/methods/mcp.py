@@ -20,6 +20,7 @@ from torchrl_mcp.methods.actor import (
     Sizes,
     input_normalisers,
     normalise_inputs,
+    require_frozen,
     sampler,
 )
 from torchrl_mcp.modules.primitives import Primitives
@@ -137,11 +138,7 @@ def weights_actor(
     Raises:
         ValueError: If the primitives are not frozen.
     """
-    if "primitives" not in frozen:
-        raise ValueError(
-            "exploration over weights trains the gate alone: use it with stage=transfer and keep 'primitives' in "
-            "transfer.freeze, or take exploration=action"
-        )
+    require_frozen("primitives", frozen, over="weights")
     gate = (
         normalise_inputs(parts),
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_loc"]),
