@@ -173,6 +173,20 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
     assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
 
 
+def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):
+    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "method=mcp", "character=biped"]
+    pretraining = ["task=imitation", "stage=pretrain", "motions=single", f"run_dir={tmp_path / 'pretraining'}"]
+    transfer = ["task=heading", "stage=transfer", f"pretrained={tmp_path / 'pretraining'}", f"run_dir={tmp_path / 'run'}"]
+    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+        for words in (pretraining, transfer):
+            run = experiment.train(compose("train", [*settings, *words]))
+    monkeypatch.setattr(builtin, "FOLDER", tmp_path)
+    policies.publish_run(tmp_path / "pretraining", tmp_path / "mcp-biped.torchrl")
+    policies.publish_run(run, tmp_path / "gate.torchrl")
+    assert set(checkpoint.shared(tmp_path / "gate.torchrl")) == {"primitives", "observation_normaliser"}
+    torch.testing.assert_close(act(tmp_path / "gate.torchrl"), act(run), atol=0.02, rtol=0)
+
+
 def test_over_other_primitives_than_its_own_a_gate_is_neither_played_nor_published(run, library, monkeypatch, tmp_path):
     monkeypatch.setattr(builtin, "FOLDER", tmp_path)
     other = Path(shutil.copy(PRETRAINED, tmp_path))

@@ -66,7 +66,7 @@ def restore(
 def publish_run(path: Path, output: Path) -> None:
     """Write the policy of a run as a separate checkpoint file, as small as the built-in networks.
 
-    The file leaves out the frozen parts if a built-in network has the same, bit for bit.
+    The file leaves out the frozen parts if a built-in network has the same in bfloat16, bit for bit.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.

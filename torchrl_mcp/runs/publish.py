@@ -38,25 +38,33 @@ def publish(
 
 
 def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> dict[str, str]:
-    """Return the fingerprints of parts, after checking that they equal those of a checkpoint file bit for bit.
+    """Return the fingerprints of parts in bfloat16, after checking that they equal those of a published file.
 
     Args:
         parts: Parts of an agent.
         names: Names of the parts to compare.
-        origin: The checkpoint file.
+        origin: The published file.
 
     Raises:
         ValueError: If a part differs, or the file does not hold it.
     """
     held = nn.ModuleDict({name: copy.deepcopy(parts[name]) for name in names})
     checkpoint.load_parts(held, names, origin)
-    own = {name: fingerprint(parts[name]) for name in names}
+    own = {name: fingerprint(_rounded(parts[name])) for name in names}
     if differing := [name for name in names if fingerprint(held[name]) != own[name]]:
         raise ValueError(
             f"the policy was trained over other {' and '.join(differing)} than {origin.name} holds, which come with "
             "the library: train it again with pretrained=builtin"
         )
     return own
+
+
+def _rounded(part: nn.Module) -> nn.Module:
+    """Return a copy with the parameters that a published file has."""
+    part = copy.deepcopy(part)
+    for parameter in part.parameters():
+        parameter.data = parameter.data.to(torch.bfloat16).to(parameter.dtype)
+    return part
 
 
 def load_kept(parts: nn.ModuleDict, names: Collection[str], path: Path, origin: Callable[[], Path]) -> None:
