@@ -176,7 +176,12 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
 def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "method=mcp", "character=biped"]
     pretraining = ["task=imitation", "stage=pretrain", "motions=single", f"run_dir={tmp_path / 'pretraining'}"]
-    transfer = ["task=heading", "stage=transfer", f"pretrained={tmp_path / 'pretraining'}", f"run_dir={tmp_path / 'run'}"]
+    transfer = [
+        "task=heading",
+        "stage=transfer",
+        f"pretrained={tmp_path / 'pretraining'}",
+        f"run_dir={tmp_path / 'run'}",
+    ]
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         for words in (pretraining, transfer):
             run = experiment.train(compose("train", [*settings, *words]))
