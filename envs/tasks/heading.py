@@ -14,6 +14,7 @@ from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
+from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
 
 
 class Heading(PDCharacterEnv):
@@ -32,6 +33,8 @@ class Heading(PDCharacterEnv):
         num_envs: Number N of simulations.
         max_turn: Largest change :math:`\delta` of the direction per step, in radians. Paper: 0.15.
         speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin with 0. Paper: 1.
+        waypoint: End the goal with a place in the target direction, as :class:`.Location` shows places, see
+            :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`. ``goal_layout`` has its entries.
         speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for none.
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
             faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
@@ -59,6 +62,7 @@ class Heading(PDCharacterEnv):
         max_turn: float = 0.15,
         speed: float | Sequence[float] = 1.0,
         speed_interval: float = 3.0,
+        waypoint: bool = False,
         initial_directions: Sequence[float] = (0.0, 0.0),
         max_episode_steps: int = 600,
         **kwargs: Any,
@@ -66,7 +70,9 @@ class Heading(PDCharacterEnv):
         not_negative(max_turn=max_turn)
         if not speed_interval > 0:
             raise ValueError(f"speed_interval={speed_interval} is out of range: pass seconds, or inf for no changes")
-        self.max_turn, self.speeds = max_turn, _speeds(speed)
+        self.max_turn, self.speeds, self.waypoint = max_turn, _speeds(speed), waypoint
+        shown = 3 if self.changes_speed else 2  # the direction, and the speed
+        self.goal_layout = {"waypoint": slice(shown, shown + 2)} if waypoint else {}
         self.change_probability = CONTROL_TIMESTEP / speed_interval
         zero = torch.zeros((), dtype=torch.float64)
         super().__init__(
@@ -98,6 +104,9 @@ class Heading(PDCharacterEnv):
         goal = unit_vector(self.episode["direction"][ids] - self.heading(ids))
         if self.changes_speed:
             goal = torch.cat([goal, self.episode["speed"][ids].unsqueeze(-1)], -1)
+        if self.waypoint:
+            place = place_ahead(self.com[:, :2], self._target_velocity())
+            goal = torch.cat([goal, place_seen(self, place, ids)], -1)
         return {"observation": self.see(ids)[0], "goal": goal}
 
     def reward(self) -> Tensor:
@@ -124,7 +133,8 @@ class Heading(PDCharacterEnv):
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return mirror_signs([*VECTOR_SIGNS, 1] if self.changes_speed else VECTOR_SIGNS)
+        speed, place = [1] * self.changes_speed, VECTOR_SIGNS * self.waypoint
+        return mirror_signs([*VECTOR_SIGNS, *speed, *place])
 
     def arrows(self, index: int) -> list[Arrow]:
         """See :meth:`CharacterEnv.arrows`: an arrow in the target direction, of the speed's length in a second."""
@@ -139,10 +149,13 @@ class Heading(PDCharacterEnv):
 
     def _reward_of(self, velocity: Tensor) -> Tensor:
         """Reward of a velocity of the centre of mass ``(N, 2)`` with the current goals, ``(N,)``."""
-        direction = unit_vector(self.episode["direction"])
         if self.changes_speed:
-            return velocity_reward(velocity, direction * self.episode["speed"].unsqueeze(-1))
-        return heading_reward(velocity, direction, self.speeds[0])
+            return velocity_reward(velocity, self._target_velocity())
+        return heading_reward(velocity, unit_vector(self.episode["direction"]), self.speeds[0])
+
+    def _target_velocity(self) -> Tensor:
+        """The target direction times the target speed, ``(N, 2)``, in m/s."""
+        return unit_vector(self.episode["direction"]) * self.episode["speed"].unsqueeze(-1)
 
 
 def unit_vector(angle: Tensor) -> Tensor:

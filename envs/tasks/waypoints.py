@@ -12,6 +12,9 @@ from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, SUCCESS_REACH, lo
 STRIDE = 1.0
 """Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
 
+WALK_AHEAD = 1.5
+"""Seconds of walking at the target speed to a place ahead: at every step of speed it is beyond arrival."""
+
 LEAD = 1.0
 """Seconds of its motion by which a character looks ahead of a ball."""
 
@@ -20,6 +23,19 @@ PUSH = 0.5
 
 BEHIND = 0.7
 """Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
+
+
+def place_ahead(com: Tensor, velocity: Tensor) -> Tensor:
+    """The place where a character is after :data:`WALK_AHEAD` at a velocity; at rest, where it stands.
+
+    Args:
+        com: Centre of mass of the character, ``(*B, 2)``, in metres.
+        velocity: Target velocity, ``(*B, 2)``, in m/s.
+
+    Returns:
+        Places, ``(*B, 2)``.
+    """
+    return com + WALK_AHEAD * velocity
 
 
 def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ NO_SETTINGS = {
 """Arguments that every maker of an environment gives, or that say what is in it and not what happens."""
 RUNS_OWN = {
     "imitation": {"terms", "switch_to"},
-    "heading": {"speed"},
+    "heading": {"speed", "waypoint"},
     "location": {"final_directions"},
     "carry": {"goal_positions", "waypoint"},
     "dribble": {"goal_positions", "waypoint"},

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from torchrl_mcp.envs import Carry, Dribble, Heading, Location
+from torchrl_mcp.envs.tasks.heading import unit_vector
+from torchrl_mcp.envs.tasks.waypoints import place_ahead
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
@@ -15,9 +17,6 @@ TURN = math.radians(15)
 
 SPEED_STEP = 0.25
 """Change of the target speed by a key, in m/s."""
-
-LEAD = 1.5
-"""Seconds by which the place leads a character that is steered: at every step of speed it is beyond arrival."""
 
 
 class Steering:
@@ -205,9 +204,10 @@ class Steering:
 
     def _ahead(self) -> tuple[float, float]:
         """The place that leads the character in the target direction, x and y in metres."""
-        x, y = self.player.env.com[0, :2].tolist()
-        distance, angle = LEAD * self.target_speed, self.target_direction
-        return x + distance * math.cos(angle), y + distance * math.sin(angle)
+        env = self.player.env
+        velocity = self.target_speed * unit_vector(torch.tensor(self.target_direction, dtype=torch.float64))
+        x, y = place_ahead(env.com[0, :2].cpu(), velocity).tolist()
+        return x, y
 
 
 def _wrapped(angle: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Location
+from torchrl_mcp.envs import Carry, Dribble, Heading, Location
 from torchrl_mcp.envs.tasks.waypoints import carry_waypoint, dribble_waypoint
 
 HERE = torch.zeros(1, 2)
@@ -80,6 +80,22 @@ def test_the_goal_ends_with_the_waypoint_as_the_location_task_shows_places(task,
         np.testing.assert_allclose(goal[index, -2:], expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("speed", [0.8, (0.0, 1.0)])
+def test_the_goal_of_heading_ends_with_the_place_where_a_character_is_after_a_second_and_a_half(speed):
+    env = Heading("biped", 4, seed=0, num_threads=1, speed=speed, waypoint=True, dtype=torch.float64)
+    plain = Heading("biped", 4, seed=0, num_threads=1, speed=speed, dtype=torch.float64)
+    goal, env.episode["speed"][0] = env.reset()["goal"], 0.0
+    env.episode["direction"] += 0.5
+    assert torch.equal(goal[:, :-2], plain.reset()["goal"])
+    assert env.goal_layout["waypoint"] == slice(plain.reset()["goal"].shape[-1], goal.shape[-1])
+    goal = env.observe(slice(None))["goal"]
+    for index in range(4):
+        length = math.log1p(1.5 * float(env.episode["speed"][index]) / 0.25)
+        expected = length * np.array([math.cos(0.5), math.sin(0.5)])
+        np.testing.assert_allclose(goal[index, -2:], expected, atol=1e-9)
+    assert goal[:, -2:].any(-1).tolist() == [False, True, True, True]  # the first should stand where it is
+
+
 def test_a_place_and_a_waypoint_have_the_same_size():
     location = Location("biped", 1, seed=0, num_threads=1).reset()["goal"]
     layout = Carry("biped", 1, seed=0, num_threads=1, waypoint=True).goal_layout
@@ -91,6 +107,9 @@ def test_left_and_right_are_alike():
     scene = [torch.randn(50, 2, generator=random) for _ in range(4)]
     place, mirrored = dribble_waypoint(*scene), dribble_waypoint(*(part * sign for part in scene))
     torch.testing.assert_close(mirrored, place * sign)
-    env = Dribble("biped", 1, seed=0, num_threads=1, waypoint=True)
-    goal = env.reset()["goal"]
-    torch.testing.assert_close(env.goal_mirror()(goal)[0, -2:], goal[0, -2:] * sign)
+    for env in (
+        Dribble("biped", 1, seed=0, num_threads=1, waypoint=True),
+        Heading("biped", 1, seed=0, num_threads=1, waypoint=True, speed=(0.0, 1.0), initial_directions=(0.5, 0.6)),
+    ):
+        goal = env.reset()["goal"]
+        torch.testing.assert_close(env.goal_mirror()(goal)[0, -2:], goal[0, -2:] * sign)
