@@ -173,6 +173,17 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
     assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
 
 
+def test_the_card_compares_no_range_of_speeds_with_the_paper(tmp_path):
+    values = {"normalised_return": 0.5, "interval": (0.4, 0.6), "terminated": 0.0, "metrics": {}}
+    numbers = {"episodes": 2, "seed": 0, "deterministic": values, "stochastic": values}
+    (tmp_path / "gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
+    for range_of_speeds, said in (([], "the paper: 0.970 ± 0.003"), (["+task.transfer.speed=[0.0,1.0]"], "no return")):
+        with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+            cfg = compose("train", ["task=heading", "character=humanoid", "stage=transfer", *range_of_speeds])
+        card = publishing.model_card(tmp_path / "gate.torchrl", cfg, numbers, origin={}, steps=1, limits=[])
+        assert said in card
+
+
 def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "method=mcp", "character=biped"]
     pretraining = ["task=imitation", "stage=pretrain", "motions=single", f"run_dir={tmp_path / 'pretraining'}"]
@@ -225,7 +236,7 @@ def test_the_card_of_a_network_for_imitation_has_the_published_numbers(character
 
 
 GATES = sorted(filter(builtin.has_task, PRETRAINED.parent.glob("*.torchrl")))
-LONG = ("mcp-biped-carry", "mcp-biped-dribble", "mcp-humanoid-location")
+LONG = ("mcp-biped-carry", "mcp-biped-dribble", "mcp-humanoid-location", "mcp-trex-dribble")
 
 
 @pytest.mark.parametrize("gate", GATES, ids=lambda path: path.stem)
@@ -244,9 +255,13 @@ def test_every_gate_that_comes_with_the_library_does_its_task(gate):
         numbers = played(gate, num_envs=4, max_episode_steps=120)
         assert numbers["terminated"] == 0.0
         assert numbers["reach"]["place"] > 0.5
+    elif "speeds" in gate.stem:
+        numbers = played(gate, num_envs=4, curriculum=None, max_episode_steps=240)
+        assert numbers["terminated"] == 0.0
+        assert numbers["normalised_return"] > 0.7
     elif "location" in gate.stem:
         near = {"target_distances": (1.0, 2.0), "target_intervals": (20.0, 20.0), "max_episode_steps": 240}
         assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > 0.8
     else:
         near = {"object_distances": (1.0, 2.0), "target_distances": (1.0, 2.0), "max_episode_steps": 450}
-        assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > 0.6
+        assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > (0.4 if "trex" in gate.stem else 0.6)

@@ -55,21 +55,8 @@ def test_with_a_small_gain_every_primitive_starts_at_zero_mean_and_its_initial_s
     torch.testing.assert_close(scale, torch.full_like(scale, initial_std), atol=0, rtol=0.02)
 
 
-def test_standard_deviations_can_be_the_same_in_all_states():
-    primitives = Primitives(27, 8, 3, initial_std=0.5, state_dependent_std=False)
-    assert count(primitives) == count(Primitives(27, 8, 3)) - 3 * 257 * 8 + 3 * 8
-    loc, scale = primitives(torch.randn(10, 27))
-    assert (scale == 0.5).all()
-    assert loc.std(0).min() > 0
-    scale[:, 1, 2].sum().backward()
-    moved = {name for name, parameter in primitives.named_parameters() if parameter.grad is not None}
-    assert moved == {"log_std"}
-    assert primitives.log_std.grad.nonzero().tolist() == [[1, 2]]
-
-
-@pytest.mark.parametrize("state_dependent_std", [True, False])
-def test_means_and_standard_deviations_are_rescaled_together(state_dependent_std):
-    primitives = Primitives(27, 8, 3, state_dependent_std=state_dependent_std)
+def test_means_and_standard_deviations_are_rescaled_together():
+    primitives = Primitives(27, 8, 3)
     states = torch.randn(10, 27)
     before = primitives(states)
     primitives.rescale(2.5)

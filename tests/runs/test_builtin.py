@@ -89,14 +89,6 @@ def test_loaded_networks_keep_their_width_and_new_ones_have_the_runs(run, publis
     assert records.run_config(experiment.train(longer)).width == 0.0625
 
 
-def test_loaded_primitives_keep_the_kind_of_their_noise(tmp_path):
-    ant = ["method=mcp", "task=holdout", "training.total_frames=128"]
-    paper = experiment.train(configure(tmp_path / "paper", *ant, "stage=pretrain", "state_dependent_std=true"))
-    cfg = configure(tmp_path / "gate", *ant, "stage=transfer", f"pretrained={paper}")
-    assert not cfg.state_dependent_std  # the ant's
-    assert records.run_config(experiment.train(cfg)).state_dependent_std
-
-
 def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
     settings = [*BIPED, "motions=turning", "training.total_frames=128"]
     for origin, missing in ((checkpoint.find(run), set()), (published, {"critic"})):

@@ -72,7 +72,9 @@ def test_a_run_that_was_trained_with_what_is_removed_cannot_be_resumed(setting, 
     with pytest.raises(ValueError, match=rf"trained with {next(iter(setting))}=.*: resume it with the version"):
         require_resumable(config)
     unused = {"stage": {"name": "pretrain"}, "task": {"pretrain": {"failure_weighting": 0.0, "shaping": {}}}}
-    require_resumable(unused)
+    require_resumable({**unused, "state_dependent_std": True})
+    with pytest.raises(ValueError, match="trained with state_dependent_std=False"):
+        require_resumable({**unused, "state_dependent_std": False})
     monkeypatch.setattr(experiment, "is_complete", lambda folder: False)
     OmegaConf.save(config, tmp_path / "config.yaml")
     with pytest.raises(ValueError, match="which this version lacks"):

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
 from torchrl_mcp.runs import policies, records
@@ -104,7 +104,7 @@ def _contents(path: Path, cfg: DictConfig) -> str:
     if not (shared := checkpoint.shared(path)):
         return "the whole policy"
     origin = builtin(cfg.method.name, cfg.character.name)
-    return f"the parts that were trained; {' and '.join(shared)} are in `{origin.name}`"
+    return f"all but {' and '.join(shared)}, which `{origin.name}` has"
 
 
 def _returns(numbers: Mapping[str, Any]) -> str:
@@ -115,8 +115,8 @@ def _returns(numbers: Mapping[str, Any]) -> str:
 
 
 def _paper(cfg: DictConfig) -> str:
-    """Return the paper's number in Table 2, if it has one."""
+    """Return the paper's number in Table 2, if it has one. Its heading has a single speed."""
     reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
-    if cfg.stage.name != "transfer" or reported is None:
+    if cfg.stage.name != "transfer" or reported is None or OmegaConf.is_list(cfg.task.evaluation.get("speed")):
         return "no return"
     return f"{reported.mean:.3f} ± {reported.std:.3f}"

@@ -24,8 +24,6 @@ class Primitives(nn.Module):
         branch_cells: Hidden units of each primitive's own layer; 0 for none.
         width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
-        state_dependent_std: Whether standard deviations depend on the state, as in the paper; otherwise each primitive
-            learns one for each action.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
 
     Raises:
@@ -45,7 +43,6 @@ class Primitives(nn.Module):
         branch_cells: int = 256,
         width: float = 1.0,
         initial_std: float = 1.0,
-        state_dependent_std: bool = True,
         output_gain: float = 1.0,
     ) -> None:
         super().__init__()
@@ -58,35 +55,27 @@ class Primitives(nn.Module):
         self.trunk = relu_mlp(observation_dim, trunk_cells)
         self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
         self.rectifier = nn.ReLU() if branch_cells else nn.Identity()
-        outputs = 2 * action_dim if state_dependent_std else action_dim
-        self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], outputs)
-        self.log_std = None if state_dependent_std else nn.Parameter(torch.zeros(num_primitives, action_dim))
+        self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], 2 * action_dim)
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
             self.output.bias.zero_()
-            self._log_std_bias()[:] = math.log(initial_std)
+            self.output.bias[:, action_dim:] = math.log(initial_std)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
         features = self.trunk(observation).unsqueeze(-2)
         if self.branches is not None:
             features = self.rectifier(self.branches(features))
-        output = self.output(features)
-        loc, log_std = output.chunk(2, dim=-1) if self.log_std is None else (output, self.log_std.expand_as(output))
-        return loc, log_std.float().exp()
+        loc, log_scale = self.output(features).chunk(2, dim=-1)
+        return loc, log_scale.float().exp()
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
         """Multiply all means and standard deviations by ``factor``, positive."""
-        log_std = self._log_std_bias()
-        action_dim = log_std.shape[-1]
+        action_dim = self.output.bias.shape[-1] // 2
         self.output.weight[..., :action_dim] *= factor
         self.output.bias[:, :action_dim] *= factor
-        log_std += math.log(factor)
-
-    def _log_std_bias(self) -> Tensor:
-        """Constant part of the logarithms of the standard deviations, ``(K, A)``."""
-        return self.output.bias.chunk(2, dim=-1)[1] if self.log_std is None else self.log_std
+        self.output.bias[:, action_dim:] += math.log(factor)
 
 
 class BatchedLinear(nn.Module):

@@ -48,7 +48,7 @@ def planned(cfg: DictConfig) -> Plan:
     config = require_valid(cfg)
     where = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _shapes(cfg, initial)))
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _widths(cfg, initial)))
     return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
 
 
@@ -81,11 +81,11 @@ def initial_networks(cfg: DictConfig) -> Path | None:
     return checkpoint.find(Path(cfg.pretrained))
 
 
-def _shapes(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
-    """Return the settings that give the networks of a run the shapes of those that it takes from a checkpoint file."""
+def _widths(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
+    """Return the widths of the networks that a run takes from a checkpoint file."""
     if initial is None:
         return {}
     saved = checkpoint.saved_config(initial)
     width = saved.get("width", 1.0)  # older networks have the paper's
-    kept = {"kept_width": saved.get("kept_width", width), "state_dependent_std": saved.get("state_dependent_std", True)}
+    kept = {"kept_width": saved.get("kept_width", width)}
     return kept if cfg.stage.name == "transfer" else {**kept, "width": width}

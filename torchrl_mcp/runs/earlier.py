@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-REMOVED = {"failure_weighting": 0.0, "shaping": {}}
-"""Settings of environments that this version lacks, with the values at which they had no effect."""
+REMOVED = {"failure_weighting": 0.0, "shaping": {}, "state_dependent_std": True}
+"""Settings that this version lacks, with the values at which they had no effect."""
 
 AIDS = ("initial_states", "mixture", "emphasis", "staggered", "discount")
 """Settings of environments that are one setting in this version, ``curriculum``."""
@@ -42,10 +42,10 @@ def require_resumable(config: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If it was trained with something that this version lacks.
     """
-    stage = config["task"][config["stage"]["name"]]
-    if lost := [name for name, value in REMOVED.items() if stage.get(name, value) != value]:
+    held = {**config, **config["task"][config["stage"]["name"]]}
+    if lost := [name for name, value in REMOVED.items() if held.get(name, value) != value]:
         raise ValueError(
-            f"the run is trained with {lost[0]}={stage[lost[0]]}, which this version lacks: resume it with the version "
+            f"the run is trained with {lost[0]}={held[lost[0]]}, which this version lacks: resume it with the version "
             "that wrote it, whose commit is in the run folder's origin.json"
         )
 
