@@ -264,4 +264,6 @@ def test_every_gate_that_comes_with_the_library_does_its_task(gate):
         assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > 0.8
     else:
         near = {"object_distances": (1.0, 2.0), "target_distances": (1.0, 2.0), "max_episode_steps": 450}
-        assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > (0.4 if "trex" in gate.stem else 0.6)
+        assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > (
+            0.4 if "trex" in gate.stem else 0.6
+        )
