@@ -29,9 +29,6 @@ ARCHIVE = "runs.tar.xz"
 CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
 """Columns of metrics in an archive: those of learning curves and wall times."""
 
-MOST = 0.8
-"""Share of the last return whose time is in the tables."""
-
 EMPTY = ""
 """A cell of a table without runs, or without a number in the paper."""
 
@@ -146,16 +143,15 @@ def line(cell: Cell) -> dict[str, Any]:
     else:
         facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
         facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
-    times = {"minutes": round(cell.seconds / 60), f"to {MOST:g}": f"{minutes_to(MOST, cell):.1f}"}
+    times = {"minutes": round(cell.seconds / 60), "to 0.8": f"{minutes_to_most(cell):.1f}"}
     return facts | times | {"commit": ", ".join(cell.commits)}
 
 
-def minutes_to(share: float, cell: Cell) -> float:
-    """Return the minutes of training until the learning curve reaches a share of its last value."""
+def minutes_to_most(cell: Cell) -> float:
+    """Return the minutes of training until the learning curve, a mean over seeds, reaches 0.8 of its last value."""
     (curve,) = learning_curves({"": [run.path for run in cell.complete]})
-    reached = next(
-        frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= share * curve.mean[-1]
-    )
+    most = 0.8 * curve.mean[-1]
+    reached = next(frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= most)
     return float(reached) / cell.complete[0].frames * cell.seconds / 60
 
 

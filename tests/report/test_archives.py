@@ -1,6 +1,7 @@
 """Table 2 and the table of ablations, of runs whose numbers are made up, and the published tables."""
 
 import csv
+import importlib
 import json
 import re
 import runpy
@@ -12,6 +13,9 @@ from statistics import mean
 
 import pytest
 from omegaconf import OmegaConf
+
+from torchrl_mcp.report.comparison import cells
+from torchrl_mcp.report.results import find_runs
 
 ROOT = Path(__file__).parents[2]
 PUBLISHED = ROOT / "benchmarks/results"
@@ -47,6 +51,18 @@ def add_tracking_error(run):
     for mode in ("deterministic", "stochastic"):
         found[mode]["metrics"] = {"tracking_error": 0.05}
     path.write_text(json.dumps(found))
+
+
+def test_the_minutes_to_most_of_a_return_are_those_of_the_learning_curve(write_run, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    archive = importlib.import_module("archive")
+    run = write_run("run", score=0.9)
+    rows = [(i, 10 * i, 6 * i, 1, i / 100) for i in range(1, 101)]  # a return that grows with time, for ten minutes
+    header = (run / "metrics.csv").read_text().splitlines()[0].split(",")
+    with (run / "metrics.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    (cell,) = cells(find_runs([run.parent])[0])
+    assert archive.minutes_to_most(cell) == pytest.approx(8.0, abs=0.2)
 
 
 @pytest.fixture
