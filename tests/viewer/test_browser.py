@@ -1,13 +1,16 @@
 """Steering in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``."""
 
 import contextlib
+import io
 import math
 import shutil
 import threading
 import time
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
@@ -128,6 +131,13 @@ def move(page, x, y):
     page.wait_for_timeout(LONG)
 
 
+def click(page, x, y):
+    move(page, x, y)
+    page.mouse.down()
+    page.wait_for_timeout(2 * LONG)
+    page.mouse.up()
+
+
 def stands_still(player, page):
     steps = player.steps
     page.wait_for_timeout(500)
@@ -140,10 +150,7 @@ def test_what_is_done_in_the_browser_reaches_the_player(visit):
     page, state = visit(player), player.env.simulation.state
 
     before = target(player).clone()  # a click on the ground places the target
-    move(page, WIDTH - 60, HEIGHT - 80)
-    page.mouse.down()
-    page.wait_for_timeout(2 * LONG)
-    page.mouse.up()
+    click(page, WIDTH - 60, HEIGHT - 80)
     wait(lambda: (target(player) != before).any(), page)
     assert torch.linalg.vector_norm(target(player) - player.env.simulation.outputs["xpos"][0, 1, :2]) < 4.0
     assert player.pushed == 0.0
@@ -170,17 +177,15 @@ def test_what_is_done_in_the_browser_reaches_the_player(visit):
 
 
 def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_arrow_keys_and_a_stop(visit):
-    _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, curriculum=None)
+    changes = {"curriculum": None, "target_intervals": (1e6, 1e6), "max_episode_steps": 10**6}
+    _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, **changes)
     player = Show(agent.actor.policy, env)
     page = visit(player)
     place = env.episode["target"][0]
 
-    def click(x, y):
+    def choose(x, y):
         before = place.clone()
-        move(page, x, y)
-        page.mouse.down()
-        page.wait_for_timeout(2 * LONG)
-        page.mouse.up()
+        click(page, x, y)
         wait(lambda: (place != before).any(), page)
 
     def away():
@@ -193,15 +198,15 @@ def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_
     def speed():
         return float(torch.linalg.vector_norm(env.simulation.state["qvel"][0, :2]))
 
-    click(WIDTH - 60, HEIGHT - 80)
+    choose(WIDTH - 60, HEIGHT - 80)
     first = away()
     wait(lambda: away() < first - 0.3, page)
-    click(WIDTH - 60, HEIGHT / 2)  # while it walks; the panel covers the left half
+    choose(WIDTH - 60, HEIGHT / 2)  # while it walks; the panel covers the left half
     wait(lambda: env.episode["success"][0], page)
     page.wait_for_timeout(3000)
     assert away() < 0.5
     assert speed() < 0.3
-    click(WIDTH - 60, HEIGHT - 80)
+    choose(WIDTH - 60, HEIGHT - 80)
     far = away()
     wait(lambda: away() < far - 0.3, page)
     move(page, WIDTH / 2, HEIGHT - 80)
@@ -211,3 +216,36 @@ def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_
     hold(page, " ", lambda: away() < 0.3)  # where it is
     wait(lambda: speed() < 0.1, page)
     assert not player.began
+
+
+def test_the_biped_takes_a_box_that_was_clicked_to_the_ground_that_was_clicked(visit):
+    distances = dict.fromkeys(["object_distances", "target_distances"], (1.5, 1.6))
+    directions = dict.fromkeys(["object_directions", "target_directions"], (-0.1, 0.1))
+    changes = {"curriculum": None, "max_episode_steps": 10**6} | distances | directions
+    _, agent, env = restore(builtin("mcp", "biped", "carry"), num_envs=1, seed=1, **changes)
+    model = env.simulation.model
+    model.geom_rgba[model.body("box").geomadr[0]] = 1.0, 0.0, 1.0, 1.0
+    player = Show(agent.actor.policy, env)
+    page = visit(player)
+
+    def stands():
+        return player.state["success"][0]
+
+    wait(stands, page)
+    page.wait_for_timeout(2 * LONG)  # until the picture has this state
+    red, green, blue = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float).transpose(2, 0, 1)
+    rows, columns = ((red > 2 * green) & (blue > 2 * green)).nonzero()
+    first = target(player).clone()
+    click(page, columns.mean(), rows.mean())  # on the box
+    page.wait_for_timeout(LONG)
+    assert stands()
+    assert (target(player) == first).all()
+    click(page, WIDTH - 60, HEIGHT - 80)  # on the ground
+    wait(lambda: (target(player) != first).any(), page)
+    place = target(player).clone()
+    wait(lambda: not stands(), page)
+    wait(stands, page)
+    box = env.simulation.outputs["xpos"][0, model.body("box").id, :2]
+    assert torch.linalg.vector_norm(box - place) < 0.2
+    assert torch.linalg.vector_norm(place - first) > 0.5
+    assert player.pushed < 1.0
