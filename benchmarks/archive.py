@@ -17,7 +17,7 @@ from typing import Any
 
 from report import write
 
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves
+from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import DEFAULT, Cell, cells
 from torchrl_mcp.report.paper import PLACES
@@ -88,7 +88,7 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
     """Write the table and the learning curves of each task, and the list of all runs.
 
     In a task, runs with more steps than the shortest that is not scratch are in the table alone; all of scratch's are
-    among the curves.
+    among the curves, up to four times these steps.
     """
     for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
@@ -96,8 +96,11 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
         stem = output / "_".join([*place, stage] if twice else place)
         stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
         drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
-        curves = learning_curves({label(cell): [run.path for run in cell.complete] for cell in drawn})
-        save_figure(draw_curves(curves, ylabel="normalised return in training"), stem)
+        curves = [learning_curve(cell) for cell in drawn]
+        figure = draw_curves(curves, ylabel="normalised return in training")
+        shortest = min(float(curve.frames.max()) for curve in curves)
+        figure.axes[0].set_xlim(0, min(4 * shortest, max(float(curve.frames.max()) for curve in curves)))
+        save_figure(figure, stem)
     write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
 
 
@@ -149,10 +152,16 @@ def line(cell: Cell) -> dict[str, Any]:
 
 def minutes_to_most(cell: Cell) -> float:
     """Return the minutes of training until the learning curve, a mean over seeds, reaches 0.8 of its last value."""
-    (curve,) = learning_curves({"": [run.path for run in cell.complete]})
+    curve = learning_curve(cell)
     most = 0.8 * curve.mean[-1]
     reached = next(frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= most)
     return float(reached) / cell.complete[0].frames * cell.seconds / 60
+
+
+def learning_curve(cell: Cell) -> Curve:
+    """Return the learning curve of a cell, in bins of its own steps."""
+    (curve,) = learning_curves({label(cell): [run.path for run in cell.complete]})
+    return curve
 
 
 def score(cell: Cell | None) -> str:
