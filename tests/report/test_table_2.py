@@ -55,7 +55,7 @@ def test_the_published_runs_make_table_2(published, tmp_path):
         )
         if stage == "transfer":
             steps = int(re.search(r"total_frames: (\d+)", settings)[1])
-            pretraining = re.search(r"^budget:\n(?:  .*\n)*?  pretrain: (\d+)", settings, re.MULTILINE)[1]
+            pretraining = re.search(r"^budget:\n(?:  .*\n)*?  pretrain:(.*(?:\n    .*)*)", settings, re.MULTILINE)[1]
             found = json.loads(path.read_text())["deterministic"]
             evaluations[task, character, method, steps][exploration, pretraining].append(found)
     table = (PUBLISHED / "table.md").read_text().splitlines()
