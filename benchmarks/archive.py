@@ -88,7 +88,7 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
     """Write the table and the learning curves of each task, and the list of all runs.
 
     In a task, runs with more steps than the shortest that is not scratch are in the table alone; all of scratch's are
-    among the curves, up to four times these steps.
+    among the curves. A picture ends at four times the steps of its shortest curve.
     """
     for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
@@ -98,8 +98,8 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
         drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
         curves = [learning_curve(cell) for cell in drawn]
         figure = draw_curves(curves, ylabel="normalised return in training")
-        shortest = min(float(curve.frames.max()) for curve in curves)
-        figure.axes[0].set_xlim(0, min(4 * shortest, max(float(curve.frames.max()) for curve in curves)))
+        ends = [float(curve.frames[-1]) for curve in curves]
+        figure.axes[0].set_xlim(0, min(4 * min(ends), max(ends)))
         save_figure(figure, stem)
     write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
 
