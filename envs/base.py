@@ -365,6 +365,8 @@ class CharacterEnv(EnvBase):
 
     def _emit(self, ids: Tensor | slice, reward: Tensor | None, terminated: Tensor, truncated: Tensor) -> TensorDict:
         """Output for all simulations, of which only ``ids`` have changed since the last output."""
+        if not self._observed:
+            raise RuntimeError(f"{type(self).__name__} has no specs: call make_specs() at the end of its constructor")
         for key, value in self._observed_of(ids).items():
             if isinstance(ids, slice):
                 self._observed[key].copy_(value)
@@ -391,7 +393,17 @@ class CharacterEnv(EnvBase):
 
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward of the step (float64) and whether it ended the episode, ``(N,)`` each."""
-        return self.reward(), self.terminated()
+        return self._each("reward"), self._each("terminated")
+
+    def _each(self, method: str) -> Tensor:
+        """What a method of the task returns, one number or flag for each simulation, ``(N,)``."""
+        value: Tensor = getattr(self, method)()
+        if value.shape != (self.num_envs,):
+            raise ValueError(
+                f"{type(self).__name__}.{method}() has shape {tuple(value.shape)}: return {(self.num_envs,)}, one for "
+                "each simulation"
+            )
+        return value
 
     @property
     def metric_names(self) -> dict[str, list[str]]:

@@ -17,7 +17,7 @@ class Curriculum:
 
     Args:
         initial_states: ``"rest"``, ``"motions"`` or a weight for each, see
-            :class:`~torchrl_mcp.envs.tasks.initial_states.InitialStates`.
+            :class:`~torchrl_mcp.envs.initial_states.InitialStates`.
         motions: Motions for initial states, None for the character's generated ones.
         mixture: Alternatives to the task's ranges, see :class:`~torchrl_mcp.envs.tasks.ranges.Ranges`.
         reward_weights: Weights of the terms of the reward for training; None to train with the task's own reward.

@@ -5,6 +5,7 @@ the CPU they therefore use arrays, on other devices tensors, stored by component
 ``(L, 13, n)``.
 """
 
+import math
 from types import ModuleType
 
 import numpy as np
@@ -95,12 +96,12 @@ def _arrays(tensor: Tensor) -> ModuleType:
 def _planes(field: Tensor) -> Array:
     """A view of L vectors for each of n simulations, shape ``(*B, L, C)``, as ``(L, C, n)``."""
     array = as_array(field)
-    return by_component(array.reshape(-1, *array.shape[-2:]))
+    return by_component(array.reshape(math.prod(array.shape[:-2]), *array.shape[-2:]))
 
 
 def _flat(seen: Array) -> Array:
     """Numbers of all bodies, from ``(L, 13, n)`` to ``(13 L, n)``."""
-    return seen.reshape(-1, seen.shape[-1])
+    return seen.reshape(seen.shape[0] * seen.shape[1], seen.shape[-1])
 
 
 def _rows(seen: Array, angle: Tensor) -> Tensor:

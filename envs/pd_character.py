@@ -14,9 +14,10 @@ from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
 from torchrl_mcp.envs.characters.kinematics import BodyStates, origin_velocities
-from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_state
+from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_state, require_mirror_images
 from torchrl_mcp.envs.characters.stance import rest_controls
 from torchrl_mcp.envs.curriculum import Curriculum
+from torchrl_mcp.envs.initial_states import InitialStates
 from torchrl_mcp.envs.observations import character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
 from torchrl_mcp.envs.rendering.ground import add_ground
@@ -118,6 +119,9 @@ class PDCharacterEnv(CharacterEnv):
             **kwargs,
         )
         self.terminate_on_fall = terminate_on_fall
+        self.initial_states = InitialStates(
+            character, self.curriculum.initial_states, self.curriculum.motions, self.device
+        )
         self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5]).to(self.device)
         self._rest = torch.from_numpy(model.qpos0).to(self.device)
         self._centre = torch.from_numpy(rest_controls(model)).to(self.device)
@@ -145,7 +149,12 @@ class PDCharacterEnv(CharacterEnv):
         return tuple(CHARACTERS)
 
     def mirrors(self) -> dict[str, Mirror]:
-        """See :meth:`CharacterEnv.mirrors`."""
+        """See :meth:`CharacterEnv.mirrors`.
+
+        Raises:
+            ValueError: If the character's frames are no mirror images of each other.
+        """
+        require_mirror_images(self.character.spec().compile(), self.character.sides)
         return {
             "observation": mirror_state(self._bodies, sides=self.character.sides),
             "goal": self.goal_mirror(),
@@ -192,17 +201,27 @@ class PDCharacterEnv(CharacterEnv):
         """
         raise NotImplementedError
 
+    def make_specs(self) -> None:
+        """See :meth:`CharacterEnv.make_specs`.
+
+        Raises:
+            ValueError: If the curriculum mixes ranges of a task that draws from none.
+        """
+        if self.curriculum.mixture and not hasattr(self, "ranges"):
+            raise ValueError(f"mixture is for ranges, and {type(self).__name__} draws from none: leave it out")
+        super().make_specs()
+
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step: a fall earns nothing, and ends the episode unless told otherwise."""
         fallen = self.fallen()
         reward, terminated = (
-            self.reward().masked_fill(fallen, 0.0),
-            self.terminated() | (fallen & self.terminate_on_fall),
+            self._each("reward").masked_fill(fallen, 0.0),
+            self._each("terminated") | (fallen & self.terminate_on_fall),
         )
         if self.curriculum.reward_weights is None:
             return reward, terminated
         self.episode[TASK_REWARD].copy_(reward)[diverged] = 0.0
-        return self.training_reward().masked_fill(fallen, 0.0), terminated
+        return self._each("training_reward").masked_fill(fallen, 0.0), terminated
 
     def _observed_of(self, ids: Tensor | slice) -> dict[str, Tensor]:
         observed = self.observe(ids)
@@ -228,9 +247,12 @@ class PDCharacterEnv(CharacterEnv):
         return self._centre + action * self._scale
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
-        """Return the scene at rest, with the first episodes shortened if the curriculum says so."""
+        """Return the scene at rest with the character as the curriculum says, and the first episodes shortened.
+
+        Tasks add their draws to it.
+        """
         qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
-        start = {"qpos": self._rest.repeat(num, 1), "qvel": qvel}
+        start = self.initial_states.fill({"qpos": self._rest.repeat(num, 1), "qvel": qvel}, self.generator)
         if self.curriculum.random_first_length and num == self.num_envs:
             start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
         return start

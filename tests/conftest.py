@@ -42,7 +42,7 @@ def _corpora_generated_once():
     """Give the environments of all tests the same corpora, which nobody changes and which take a third of a second."""
     once = cache(generated_library)
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("motions", "tasks.initial_states"):
+        for module in ("motions", "initial_states"):
             patch.setattr(f"torchrl_mcp.envs.{module}.generated_library", once)
         yield
 

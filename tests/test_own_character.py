@@ -173,3 +173,12 @@ def test_units_other_than_metres_are_pointed_out(command, tmp_path):
 def test_it_ends_with_a_film(gymnast):
     folder, _ = gymnast
     assert (folder / "walk.gif").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(("name", "owner"), [("trex", "a character of the library"), ("random", "a Python module, ")])
+def test_names_that_would_be_taken_for_others_are_refused(gymnast, command, name, owner):
+    folder, _ = gymnast
+    done = command("character", "adapt", "humanoid.xml", "--pose", "knee=-0.035", "--name", name, cwd=folder)
+    assert done.returncode == 1
+    assert f"{name} is the name of {owner}" in done.stderr
+    assert not (folder / f"{name}.xml").exists()

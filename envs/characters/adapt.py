@@ -61,9 +61,9 @@ def adapted(
 ) -> Adapted:
     """Make a body a :class:`~torchrl_mcp.envs.characters.Character`, as far as possible.
 
-    Floor, lights, cameras, tendons and sensors are left out, and shapes that do not collide if they are meshes;
-    cylinders become capsules and ellipsoids boxes. Several hinges of a body become a ball joint, whose targets have the
-    ranges of the hinges about each axis. Each joint gets a position servo, see
+    Floor, lights, cameras, tendons, equality constraints and sensors are left out, and shapes that do not collide if
+    they are meshes; cylinders become capsules and ellipsoids boxes. Several hinges of a body become a ball joint, whose
+    targets have the ranges of the hinges about each axis. Each joint gets a position servo, see
     :func:`~torchrl_mcp.envs.characters.drives.drive`. The body is put on the ground. Masses, inertias, ranges of
     hinges, and damping, stiffness and friction loss of joints stay the same.
 

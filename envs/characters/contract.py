@@ -3,10 +3,12 @@
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
+from torchrl_mcp.envs.characters.mirror import without_mirror_image
 from torchrl_mcp.envs.characters.sides import SIDES, Sides, twin
 from torchrl_mcp.envs.characters.stance import collapse
 
@@ -64,12 +66,14 @@ def violations(
     named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
     found = [
         *_scenery(model),
+        *_defaults(spec),
         *_root(model),
         *_joints(model),
         *_actuators(model),
         *_shapes(model),
         *_rest(model),
         *_names(model, named, sides),
+        *_symmetry(model, sides),
         *_timestep(model),
     ]
     if not found and (failure := collapse(spec, tuple(feet))):
@@ -116,6 +120,16 @@ def _scenery(model: mujoco.MjModel) -> Iterator[Violation]:
         yield Violation(f"has a floor or other scenery of its own ({', '.join(own)})", "remove it, tasks bring theirs")
     if model.nlight:
         yield Violation(f"has {model.nlight} light(s) of its own", "remove them, tasks bring theirs")
+
+
+def _defaults(spec: mujoco.MjSpec) -> Iterator[Violation]:
+    if own := [
+        part.tag for part in ElementTree.fromstring(spec.to_xml()).findall("default/*") if part.tag != "default"
+    ]:
+        yield Violation(
+            f"has defaults of {', '.join(own)} in no class, which change the tasks' scenes, too",
+            "put them into a named class, the childclass of the root",
+        )
 
 
 def _root(model: mujoco.MjModel) -> Iterator[Violation]:
@@ -215,6 +229,14 @@ def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]], sides: Sides)
         yield Violation(f"{', '.join(alone)} has no twin on the other side ({pairs})", NAME_SIDES)
     elif not sided:
         yield Violation(f"no body's name begins or ends with a side ({pairs or 'none is known'})", NAME_SIDES)
+
+
+def _symmetry(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
+    if crooked := list(without_mirror_image(model, sides)):
+        yield Violation(
+            f"the frames of {', '.join(crooked)} are no mirror images of the other side's in the rest pose",
+            "turn them: mirrored motions and symmetry would be wrong",
+        )
 
 
 def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.mirror import REFLECTION
 from torchrl_mcp.envs.characters.sides import Sides, twin
 
 
@@ -84,15 +85,15 @@ def _mirror(model: mujoco.MjModel, names: tuple[str, ...], sides: Sides) -> tupl
     """Reflect y: a position changes y; a rotation, a pseudo-vector, changes x and z; left and right are exchanged."""
     source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
     for joint, name in enumerate(names):
-        here, there = model.jnt_qposadr[joint], model.joint(twin(name, sides)).qposadr[0]
+        other = names.index(twin(name, sides))
+        here, there = model.jnt_qposadr[joint], model.jnt_qposadr[other]
         match model.jnt_type[joint]:
             case mujoco.mjtJoint.mjJNT_FREE:
                 signs = [1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0]
             case mujoco.mjtJoint.mjJNT_BALL:
                 signs = [1.0, -1.0, 1.0, -1.0]
             case _:
-                axis, other = model.joint(name).axis, model.joint(twin(name, sides)).axis
-                signs = [float(axis[1] * other[1] - axis[0] * other[0] - axis[2] * other[2])]
+                signs = [-float(model.jnt_axis[joint] @ REFLECTION @ model.jnt_axis[other])]  # axes are pseudo-vectors
         source[here : here + len(signs)] = torch.arange(there, there + len(signs))
         sign[here : here + len(signs)] = torch.tensor(signs, dtype=torch.float64).round()
     return source, sign

@@ -1,8 +1,10 @@
 """Mirror images of a character's observations and actions, with left and right exchanged."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,6 +15,11 @@ BODY_SIGNS = (1, -1, 1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
 
 VECTOR_SIGNS = (1, -1)
 """Signs of a horizontal vector."""
+
+ALIKE = math.cos(math.radians(2))
+"""Cosine of the largest angle between a frame or a hinge and the mirror image of its twin's."""
+
+REFLECTION = np.diag([1.0, -1.0, 1.0])
 
 
 class Mirror(nn.Module):
@@ -44,6 +51,45 @@ class Mirror(nn.Module):
 def mirror_signs(signs: Sequence[float]) -> Mirror:
     """Return the reflection that changes signs only."""
     return Mirror(range(len(signs)), signs)
+
+
+def without_mirror_image(model: mujoco.MjModel, sides: Sides = SIDES) -> Iterator[str]:
+    """Yield the bodies whose frames or hinges, in the rest pose, are no mirror images of their twins'.
+
+    Features and motions of such a body have no mirror image by exchange and signs. Bodies without a twin are left out.
+
+    Args:
+        model: The body alone.
+        sides: Beginnings or ends of names, right and left.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names = [model.body(body).name for body in range(model.nbody)]
+    for body, name in enumerate(names[1:], start=1):
+        if (other := twin(name, sides)) not in names:
+            continue
+        there = names.index(other)
+        image, frame = REFLECTION @ data.xmat[there].reshape(3, 3) @ REFLECTION, data.xmat[body].reshape(3, 3)
+        alike = (float((image * frame).sum()) - 1) / 2 > ALIKE
+        if model.body_jntnum[body] == model.body_jntnum[there] == 1:
+            joint, twins = model.body_jntadr[body], model.body_jntadr[there]
+            hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+            alike &= not hinge or abs(model.jnt_axis[joint] @ REFLECTION @ model.jnt_axis[twins]) > ALIKE
+        if not alike:
+            yield name
+
+
+def require_mirror_images(model: mujoco.MjModel, sides: Sides = SIDES) -> None:
+    """Check that each body's frame in the rest pose is the mirror image of its twin's.
+
+    Raises:
+        ValueError: If one is not.
+    """
+    if crooked := list(without_mirror_image(model, sides)):
+        raise ValueError(
+            f"the frames of {', '.join(crooked)} are no mirror images of the other side's in the rest pose: turn them "
+            "in the body's file, or do without mirror images"
+        )
 
 
 def mirror_bodies(names: Sequence[str], *, repeats: int = 1, sides: Sides = SIDES) -> Mirror:

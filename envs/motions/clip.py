@@ -11,11 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.characters.joints import JointLayout, joint_layout
+from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import JointLayout, character_model, joint_layout
+from torchrl_mcp.envs.characters.mirror import require_mirror_images
 from torchrl_mcp.envs.motions.archive import UNREADABLE, load_arrays
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
+
+OPEN = 0.2
+"""Angle in radians of a joint between the ends of a clip from which on the clip is no loop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +39,8 @@ class MotionClip:
         loop: Whether the motion repeats.
 
     Raises:
-        ValueError: If the states have another shape, are not finite or not rotations, or ``fps`` is not positive.
+        ValueError: If the states have another shape, are not finite or not rotations, ``fps`` is not positive, or a
+            loop does not end as it began.
 
     Example:
         >>> import torch
@@ -62,6 +68,10 @@ class MotionClip:
             frame = int((~qpos.isfinite()).any(-1).nonzero()[0])
             raise ValueError(f"qpos is not finite in frame {frame}: correct or remove it")
         qpos[:, layout.quaternions] = _canonical(qpos[:, layout.quaternions])
+        if self.loop and (gap := _gap(qpos, layout)) > OPEN:
+            raise ValueError(
+                f"the clip ends with a joint {gap:.2f} rad from where it began: pass loop=False, or close it"
+            )
         object.__setattr__(self, "qpos", qpos)
         object.__setattr__(self, "fps", float(self.fps))
 
@@ -112,7 +122,12 @@ class MotionClip:
         return self.cycle.power(cycles).qvel(qvel) if self.loop else qvel
 
     def mirrored(self) -> Self:
-        """Exchange left and right, exactly: the mirror image of the mirror image is the clip."""
+        """Exchange left and right, exactly: the mirror image of the mirror image is the clip.
+
+        Raises:
+            ValueError: If the character's frames are no mirror images of each other.
+        """
+        require_mirror_images(character_model(self.character), CHARACTERS[self.character].sides)
         return replace(self, qpos=self.qpos[:, self.layout.mirror] * self.layout.mirror_sign)
 
     def resampled(self, fps: float) -> Self:
@@ -220,6 +235,14 @@ def differences(qpos: Tensor, layout: JointLayout) -> Tensor:
     turned = multiply(inverse(before[:, layout.quaternions]), after[:, layout.quaternions])
     change[:, layout.spins] = to_rotation_vector(turned)
     return change
+
+
+def _gap(qpos: Tensor, layout: JointLayout) -> float:
+    """Greatest angle in radians of a joint between the first and the last state."""
+    first, last = qpos[0], qpos[-1]
+    hinges, balls = last[layout.angles] - first[layout.angles], layout.quaternions[1:]
+    turns = to_rotation_vector(multiply(inverse(first[balls]), last[balls])).norm(dim=-1)
+    return float(torch.cat([torch.atan2(hinges.sin(), hinges.cos()).abs(), turns, hinges.new_zeros(1)]).max())
 
 
 def _canonical(quaternions: Tensor) -> Tensor:

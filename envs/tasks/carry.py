@@ -15,9 +15,18 @@ from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import about_z, heading, inverse, multiply, rotate
-from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
-from torchrl_mcp.envs.tasks.tables import CLEARANCE, HALF_SIZE, TOP_HALF_SIZE, add_box, add_joint, add_table, height_of
+from torchrl_mcp.envs.tasks.tables import (
+    CLEARANCE,
+    GAP,
+    HALF_SIZE,
+    JOINT,
+    TOP_HALF_SIZE,
+    add_box,
+    add_joint,
+    add_table,
+    height_of,
+)
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     goal_layout,
@@ -140,9 +149,6 @@ class Carry(PDCharacterEnv):
             episode={"taken": torch.zeros((), dtype=torch.float64)},
             **kwargs,
         )
-        self.initial_states = InitialStates(
-            character, self.curriculum.initial_states, self.curriculum.motions, self.device
-        )
         self.ranges = placement(
             self.curriculum.mixture,
             object_distances=object_distances,
@@ -156,15 +162,18 @@ class Carry(PDCharacterEnv):
         model, state, outputs = self.simulation.model, self.simulation.state, self.simulation.outputs
         self._carrier, self._box = self.pose(str(self.character.carrier)), self.pose("box")
         self._tables = {name: self.pose(name) for name in ("source", "target")}
-        self._vertical, self._gaps = outputs["geom_xmat"][:, model.geom("box").id, 6:], outputs["sensordata"]
-        self._joined, self._joint = state["eq_active"][:, 0], state["eq_data"][:, 0, 3:10]
+        weld, names = model.equality(JOINT).id, [model.sensor(sensor).name for sensor in range(model.nsensor)]
+        gaps = [int(model.sensor_adr[sensor]) for sensor, name in enumerate(names) if name.startswith(GAP)]
+        self._vertical = outputs["geom_xmat"][:, model.geom("box").id, 6:]
+        self._gaps = outputs["sensordata"][:, gaps[0] : gaps[-1] + 1]
+        self._joined, self._joint = state["eq_active"][:, weld], state["eq_data"][:, weld, 3:10]
         self._source_height = state["mocap_pos"][:, 1, 2]
         self.track(object=self._box[0])
         self.make_specs()
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The box on the source, and the target, at drawn places; both tables, and the box, face anywhere."""
-        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        start = super().initial_state(num)
         box, target = places(start["qpos"][:, :2], self.ranges.draw(num, self.generator))
         angles = torch.rand(num, 2, dtype=torch.float64, device=self.device, generator=self.generator)
         turns, tables = about_z(2 * math.pi * angles), self._marks.repeat(num, 1, 1)

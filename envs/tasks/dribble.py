@@ -13,7 +13,6 @@ from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
@@ -132,9 +131,6 @@ class Dribble(PDCharacterEnv):
         self.goal_positions, self.waypoint = goal_positions, waypoint
         self.goal_layout = goal_layout(OBJECTS, waypoint)
         super().__init__(character, num_envs, furnish=add_pitch, max_episode_steps=max_episode_steps, **kwargs)
-        self.initial_states = InitialStates(
-            character, self.curriculum.initial_states, self.curriculum.motions, self.device
-        )
         self.ranges = placement(
             self.curriculum.mixture,
             object_distances=object_distances,
@@ -155,7 +151,7 @@ class Dribble(PDCharacterEnv):
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """Ball and target at drawn places around the character."""
-        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        start = super().initial_state(num)
         ball, target = places(start["qpos"][:, :2], self.ranges.draw(num, self.generator))
         start["qpos"][:, -7:-5], marks = ball, self._marks.repeat(num, 1, 1)
         marks[:, 0, :2] = target

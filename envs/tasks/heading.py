@@ -11,7 +11,6 @@ from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_sign
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
@@ -82,9 +81,6 @@ class Heading(PDCharacterEnv):
             episode={"direction": zero, "speed": zero + self.speeds[1]},
             **kwargs,
         )
-        self.initial_states = InitialStates(
-            character, self.curriculum.initial_states, self.curriculum.motions, self.device
-        )
         self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
         self.make_specs()
 
@@ -96,7 +92,7 @@ class Heading(PDCharacterEnv):
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The character, a direction, and in a range of speeds one of them."""
         direction = self.ranges.draw(num, self.generator)["initial_directions"]
-        start = {**self.initial_states.fill(super().initial_state(num), self.generator), "direction": direction}
+        start = {**super().initial_state(num), "direction": direction}
         return {**start, "speed": self._uniform(num, *self.speeds)} if self.changes_speed else start
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:

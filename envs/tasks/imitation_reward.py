@@ -6,10 +6,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.characters.kinematics import BodyStates
 
 HORIZON = 0.25
 """Seconds by which velocities are multiplied, to compare them with positions."""
+
+ERRORS = (
+    "pose",
+    "velocity",
+    "root_pose",
+    "root_velocity",
+    "key_positions",
+    "bodies",
+    "orientations",
+    "com",
+)
+"""Errors of a character against its reference, for the terms of the reward."""
 
 
 class Term(NamedTuple):
@@ -17,6 +30,24 @@ class Term(NamedTuple):
 
     weight: float
     scale: float
+
+
+def checked_terms(terms: Mapping[str, Mapping[str, float]]) -> dict[str, Term]:
+    """Return terms by the names of errors, from their weights and scales by name.
+
+    Raises:
+        ValueError: If there is no term, a name is unknown, a weight is not positive or a scale is negative.
+    """
+    if not terms:
+        raise ValueError(f"terms are empty: pass weight and scale of one or more of {', '.join(ERRORS)}")
+    for name, term in terms.items():
+        if name not in ERRORS:
+            raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
+        if set(term) != set(Term._fields):
+            raise ValueError(f"the term {name} has {', '.join(term) or 'nothing'}: pass {' and '.join(Term._fields)}")
+        positive(**{f"terms.{name}.weight": term["weight"]})
+        not_negative(**{f"terms.{name}.scale": term["scale"]})
+    return {name: Term(**term) for name, term in terms.items()}
 
 
 def imitation_rewards(errors: Mapping[str, Tensor], terms: Mapping[str, Term]) -> Tensor:

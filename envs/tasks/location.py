@@ -13,7 +13,6 @@ from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_sign
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.tasks.initial_states import InitialStates
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
 from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, near, steps
@@ -90,9 +89,6 @@ class Location(PDCharacterEnv):
             episode={**episode, "arrived": no, "success": no, "reached": no},
             **kwargs,
         )
-        self.initial_states = InitialStates(
-            character, self.curriculum.initial_states, self.curriculum.motions, self.device
-        )
         ranges = {"target_distances": target_distances, "target_directions": target_directions}
         ranges |= {"target_intervals": target_intervals, "final_directions": final_directions or (0.0, 0.0)}
         self.ranges = Ranges(ranges, self.curriculum.mixture).to(self.device)
@@ -104,7 +100,7 @@ class Location(PDCharacterEnv):
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The character, and a place."""
-        start = self.initial_states.fill(super().initial_state(num), self.generator)
+        start = super().initial_state(num)
         return {**start, **self._place(start["qpos"][:, :2], torch.zeros(num, device=self.device))}
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:

@@ -15,6 +15,12 @@ CLEARANCE = 0.1
 While its carrier walks, a box dips by as much below its initial height, and would catch on the tops.
 """
 
+JOINT = "box_joint"
+"""Name of the joint between the box and its carrier."""
+
+GAP = "box_gap"
+"""Beginning of the names of the sensors of the gap between them."""
+
 TOP_CONTACT = 2
 """MuJoCo's contact bit of the tops, which only the box shares: for characters, tops would be walls."""
 
@@ -55,7 +61,9 @@ def add_box(spec: mujoco.MjSpec, height: float) -> None:
 def add_joint(spec: mujoco.MjSpec, carrier: str) -> None:
     """Add a switchable joint between ``carrier`` and box, exclude their contact, and sense the gap between them."""
     body = mujoco.mjtObj.mjOBJ_BODY
-    weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, objtype=body, name1=carrier, name2="box", active=False)
+    weld = spec.add_equality(
+        name=JOINT, type=mujoco.mjtEq.mjEQ_WELD, objtype=body, name1=carrier, name2="box", active=False
+    )
     weld.data[:3] = 0  # the anchor: the origin of the box
     weld.solimp[:2] = 0.999  # with MuJoCo's default of 0.9 the box sags
     spec.add_exclude(bodyname1=carrier, bodyname2="box")
@@ -63,6 +71,7 @@ def add_joint(spec: mujoco.MjSpec, carrier: str) -> None:
         if geom.conaffinity:
             geom.name = geom.name or f"{carrier}_{index}"
             spec.add_sensor(
+                name=f"{GAP}_{index}",
                 type=mujoco.mjtSensor.mjSENS_GEOMDIST,
                 objtype=mujoco.mjtObj.mjOBJ_GEOM,
                 objname=geom.name,

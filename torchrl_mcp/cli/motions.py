@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     target.add_argument(
         "--module", type=own_module, metavar="MODULE", help="Python module that adds the character to the library's"
     )
-    target.add_argument("--rate", type=float, default=30.0, help="frames per second of the clips (default %(default)s)")
+    target.add_argument("--rate", type=float, help="frames per second of the clips (default 30, or a clip's own)")
     source.add_argument("files", nargs="+", type=Path, metavar="FILE", help="motion capture or clips")
     source.add_argument("--fps", type=float, help="frames per second of the files, in place of their own (.amc: 120)")
     source.add_argument("--scale", type=float, help="metres per unit of length (default: fits the length of the legs)")

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
@@ -9,6 +10,7 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 # isort: split
 import mujoco
 
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.adapt import Adapted, adapted, key_bodies
 from torchrl_mcp.envs.characters.contract import Violation, lowest_bodies, violations
 from torchrl_mcp.envs.characters.drives import GUESSED, Drive
@@ -59,7 +61,8 @@ def adapt(arguments: argparse.Namespace) -> int:
     """Convert a file into a character, and write it with its module and its configuration.
 
     Raises:
-        ValueError: If MuJoCo cannot read the file or what was made of it, or a file to write is there already.
+        ValueError: If MuJoCo cannot read the file or what was made of it, a file to write is there already, or the name
+            is of another character or module.
     """
     name, folder, source = arguments.name, arguments.output, _read(arguments.file).compile()
     body = adapted(
@@ -77,6 +80,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     written = _parsed(text, f"what was made of {arguments.file}")
     model = written.compile()
     ends = tuple(key_bodies(model))
+    _require_unused(name, folder)
     _write(
         {
             folder / f"{name}.xml": text,
@@ -97,12 +101,23 @@ def adapt(arguments: argparse.Namespace) -> int:
     return bool(found)
 
 
+def _require_unused(name: str, folder: Path) -> None:
+    """Check that a new name is of no character and no module, which would be imported instead."""
+    known = {"ant", *(name for name, character in CHARACTERS.items() if character.file is None)}
+    found = find_spec(name)
+    if not (folder / f"{name}.xml").exists() and (name in known or (found and found.origin)):
+        owner = "a character of the library" if name in known else f"a Python module, {found and found.origin}"
+        raise ValueError(f"{name} is the name of {owner}: choose another (--name)")
+
+
 def _description(body: Adapted, source: mujoco.MjModel, pose: Sequence[str]) -> Iterator[str]:
     """Yield what was found and chosen, and a table of the joints."""
     yield f"root: {body.root}" + (f" (left out: {', '.join(body.left_out)})" if body.left_out else "")
     yield f"pose: {' '.join(pose) or 'as in the file'}"
     yield f"feet: {', '.join(body.feet)}"
     yield f"sides: {' '.join(f'{right}:{left}' for right, left in body.sides) or 'none found'}"
+    if source.neq:
+        yield f"left out: {source.neq} equality constraints, which may close chains or couple joints"
     gravity = float(abs(source.opt.gravity).max())
     if gravity and abs(gravity / GRAVITY - 1) > 0.1:
         yield f"units: gravity is {gravity:.4g} in the file, so its lengths are not in metres; they are taken as metres"

@@ -8,10 +8,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.capture.joint_motion import LONGEST, NO_ROTATION, TOP_SPEED, JointMotion, speeds
+from torchrl_mcp.envs.motions.capture.joint_motion import (
+    LONGEST,
+    NO_ROTATION,
+    TOP_SPEED,
+    JointMotion,
+    closed_numbers,
+    closed_turns,
+    speeds,
+)
 from torchrl_mcp.envs.motions.capture.skeleton import frame_rate
 from torchrl_mcp.envs.motions.capture.textfile import LARGEST_NUMBER, TextFile, shortened
-from torchrl_mcp.envs.rotations import from_rotation_vector, inverse, multiply, to_rotation_vector
 
 RIGHT_LEG, LEFT_LEG = ({f"{side}_hip": 4, f"{side}_knee": 1, f"{side}_ankle": 4} for side in ("right", "left"))
 RIGHT_ARM, LEFT_ARM = ({f"{side}_shoulder": 4, f"{side}_elbow": 1} for side in ("right", "left"))
@@ -54,9 +61,10 @@ def read_deepmimic(path: str | Path, *, fps: float | None = None, quaternion: st
     times = _times(file, frames[:, 0] if fps is None else torch.full_like(frames[:, 0], 1 / frame_rate(fps, 1.0)))
     _require_no_jump(file, root, times)
     if loop:
-        root[:, 2] = _closed(root[:, 2])
+        root[:, 2] = closed_numbers(root[:, 2])
         motion = {
-            joint: _closed(values) if values.ndim == 1 else _closed_turns(values) for joint, values in motion.items()
+            joint: closed_numbers(values) if values.ndim == 1 else closed_turns(values)
+            for joint, values in motion.items()
         }
     return JointMotion(root, motion, times, loop)
 
@@ -136,15 +144,3 @@ def _require_no_jump(file: TextFile, root: Tensor, times: Tensor) -> None:
         frame = int(fast.nonzero()[0]) + 1
         message = f"the root jumps between frames {frame} and {frame + 1}, faster than {TOP_SPEED:g} m/s: cut it there"
         raise file.error(message, _line(file, frame))
-
-
-def _closed(values: Tensor) -> Tensor:
-    """Close a cycle of numbers, shape ``(T,)``, by spreading the difference of its ends evenly over time."""
-    return values + (values[0] - values[-1]) * torch.linspace(0, 1, len(values), dtype=torch.float64)
-
-
-def _closed_turns(turns: Tensor) -> Tensor:
-    """Close a cycle of rotations, shape ``(T, 4)``, in the same way."""
-    missing = to_rotation_vector(multiply(inverse(turns[-1]), turns[0]))
-    fraction = torch.linspace(0, 1, len(turns), dtype=torch.float64)
-    return multiply(turns, from_rotation_vector(fraction.unsqueeze(-1) * missing))

@@ -16,7 +16,7 @@ from torchrl_mcp.envs.motions.capture.bvh import read_bvh
 from torchrl_mcp.envs.motions.capture.clips import as_source
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
 from torchrl_mcp.envs.motions.capture.inverse_kinematics import solved
-from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS, QUATERNIONS, JointMotion, assembled
+from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS, QUATERNIONS, JointMotion, assembled, closed
 from torchrl_mcp.envs.motions.capture.key_bodies import key_map
 from torchrl_mcp.envs.motions.capture.qpos import read_qpos
 from torchrl_mcp.envs.motions.capture.recording import record
@@ -28,6 +28,9 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 MISREAD = 30.0
 """Degrees beyond its limit that a joint reaches in most frames only if a recording is read wrongly."""
+
+RATE = 30.0
+"""Frames per second of clips, unless told otherwise."""
 
 KINDS = {
     "skeleton": "a skeleton's motion",
@@ -90,7 +93,7 @@ def imported(
     path: str | Path,
     character: str,
     *,
-    rate: float = 30.0,
+    rate: float | None = None,
     fps: float | None = None,
     scale: float | None = None,
     up: str | None = None,
@@ -107,16 +110,17 @@ def imported(
 
     The suffix determines the format. ``.bvh``, ``.amc`` (with its ``.asf``) and ``.npz`` of SMPL's bodies hold a
     person's skeleton. ``.json`` and ``.txt`` hold the joints of DeepMimic's characters, in metres. A clip in ``.npz``
-    holds another character's motion. Humanoid and biped take over the turns of a person's joints, see
-    :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`; any other character follows by inverse kinematics, see
-    :func:`~torchrl_mcp.envs.motions.capture.inverse_kinematics.solved`. ``.csv`` and other ``.npz`` hold ``qpos`` of
-    the character, see :func:`~torchrl_mcp.envs.motions.capture.qpos.read_qpos`.
+    holds a character's motion, and stays a cycle if it is one. Humanoid and biped take over the turns of a person's
+    joints, see :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`; any other character follows by inverse
+    kinematics, see :func:`~torchrl_mcp.envs.motions.capture.inverse_kinematics.solved`. ``.csv`` and other ``.npz``
+    hold ``qpos`` of the character, see :func:`~torchrl_mcp.envs.motions.capture.qpos.read_qpos`.
 
     Args:
         path: The file.
         character: Name of the character.
-        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used.
-        fps: Frames per second of the file; None for the file's own rate, or 120 for ``.amc``.
+        rate: Frames per second of the clip; the nearest rate that divides it into whole frames is used. None for 30,
+            or for those of a clip of the same character.
+        fps: Frames per second of the file; None for the file's own rate, or 120 for ``.amc``. A clip has its own.
         scale: Metres per unit of length; None for the file's own unit, or else a unit that fits the length of the legs.
         up: Axis of a skeleton's file that points up, such as ``"z"`` or ``"-y"``; None to find it, see
             :func:`~torchrl_mcp.envs.motions.capture.upright.upright`.
@@ -156,6 +160,8 @@ def imported(
             followers = {} if character in HUMANS else key_map(character, bodies)
             return _retargeted(source, character, rate, kind, followers, **skeletal)
         case "clip":
+            if fps is not None:
+                raise ValueError(f"fps does not apply to {path}, {KINDS[kind]}, which has its own: leave it out")
             return _of_clip(path, MotionClip.load(path), character, rate, kind, bodies, joint_map=joint_map, skip=skip)
         case "deepmimic":
             human = character if character in HUMANS else "humanoid"
@@ -167,12 +173,19 @@ def imported(
 
 
 def _retargeted(
-    source: SourceMotion, character: str, rate: float, kind: str, bodies: Mapping[str, str], **skeletal: Any
+    source: SourceMotion,
+    character: str,
+    rate: float | None,
+    kind: str,
+    bodies: Mapping[str, str],
+    *,
+    loop: bool = False,
+    **skeletal: Any,
 ) -> Import:
     """Retarget the motion of a skeleton, with a map of bodies for inverse kinematics."""
     if character in HUMANS:
         motion, body = retarget(source, character, **skeletal)
-        return _assembled(source.path, character, motion, rate, kind)._replace(
+        return _assembled(source.path, character, closed(motion) if loop else motion, rate, kind)._replace(
             rest_lean=body.lean(), assumed=body.assumed
         )
     arms = [part for side in SIDES for part in limb(side, ARM) if limb(side, ARM)[0] in bodies]
@@ -180,7 +193,7 @@ def _retargeted(
     motion, missed = solved(body, character, bodies)
     missed = torch.rad2deg(missed)
     _require_within(source.path, missed, kind)
-    found = _assembled(source.path, character, motion, rate, kind)
+    found = _assembled(source.path, character, closed(motion) if loop else motion, rate, kind)
     return found._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies, missed=missed)
 
 
@@ -188,25 +201,29 @@ def _of_clip(
     path: str | Path,
     clip: MotionClip,
     character: str,
-    rate: float,
+    rate: float | None,
     kind: str,
     bodies: Mapping[str, str] | None,
     *,
     joint_map: Mapping[str, str] | None = None,
     skip: int = 0,
 ) -> Import:
-    """Retarget a clip of another character."""
+    """Retarget a clip, unless it is of the same character. A cycle stays one, if no frames are left out."""
     if clip.character == character:
-        return Import(clip)
+        if joint_map or bodies:
+            raise ValueError(f"{path} is of character={character} already, and needs no map: leave it out")
+        clip = clip.section(skip / clip.fps, clip.duration) if skip else clip
+        return Import(clip if rate is None else clip.resampled(rate))
     parts = key_map(clip.character, joint_map)
     followers = {} if character in HUMANS else key_map(character, bodies)
     followers = {part: body for part, body in followers.items() if part in parts}
-    return _retargeted(as_source(clip, path), character, rate, kind, followers, joint_map=parts, skip=skip, scale=1.0)
+    source, loop = as_source(clip, path), clip.loop and not skip
+    return _retargeted(source, character, rate, kind, followers, loop=loop, joint_map=parts, skip=skip, scale=1.0)
 
 
-def _assembled(path: str | Path, character: str, motion: JointMotion, rate: float, kind: str) -> Import:
+def _assembled(path: str | Path, character: str, motion: JointMotion, rate: float | None, kind: str) -> Import:
     """Make a clip of a motion, if limits leave most of it as it is."""
-    clip, cut = assembled(character, motion, rate=rate)
+    clip, cut = assembled(character, motion, rate=RATE if rate is None else rate)
     degrees = torch.rad2deg(cut)
     _require_within(path, degrees, kind)
     return Import(clip, cut=degrees)

@@ -14,7 +14,7 @@ from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
-from torchrl_mcp.envs.rotations import from_rotation_vector, to_rotation_vector
+from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, heading, inverse, multiply, to_rotation_vector
 
 HUMANS = ("humanoid", "biped")
 """Characters with the joints of a human body."""
@@ -88,6 +88,32 @@ def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[Moti
     qpos, cut = states(character, motion)
     by_frame = MotionClip(character, grounded(character, qpos), fps=1.0)
     return MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, motion.loop), cut
+
+
+def closed(motion: JointMotion) -> JointMotion:
+    """Make a motion a cycle: heights, tilts of the root and joints end as they began; path and heading are kept."""
+    path, root = motion.path.clone(), motion.joints["root"]
+    path[:, 2] = closed_numbers(path[:, 2])
+    headings = about_z(heading(root))
+    joints = {
+        name: closed_numbers(values) if values.ndim == 1 else closed_turns(values)
+        for name, values in motion.joints.items()
+        if name != "root"
+    }
+    joints["root"] = multiply(headings, closed_turns(multiply(inverse(headings), root)))
+    return motion._replace(path=path, joints=joints, loop=True)
+
+
+def closed_numbers(values: Tensor) -> Tensor:
+    """Close a cycle of numbers, shape ``(T,)``, by spreading the difference of its ends evenly over time."""
+    return values + (values[0] - values[-1]) * torch.linspace(0, 1, len(values), dtype=torch.float64)
+
+
+def closed_turns(turns: Tensor) -> Tensor:
+    """Close a cycle of rotations, shape ``(T, 4)``, in the same way."""
+    missing = to_rotation_vector(multiply(inverse(turns[-1]), turns[0]))
+    fraction = torch.linspace(0, 1, len(turns), dtype=torch.float64)
+    return multiply(turns, from_rotation_vector(fraction.unsqueeze(-1) * missing))
 
 
 def states(character: str, motion: JointMotion) -> tuple[Tensor, Tensor]:

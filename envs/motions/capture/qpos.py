@@ -40,9 +40,10 @@ def read_qpos(
 ) -> JointMotion:
     """Read states: root position in metres, root quaternion, and joints in radians.
 
-    A CSV file has one frame a line; a first line with names makes any order of the joints' columns possible. An archive
-    has ``qpos``, or ``root_pos``, ``root_rot`` and ``dof_pos``, and may have the frame rate and ``joint_names``.
-    Columns that belong to no joint of the character are left out.
+    A CSV file has one frame a line; a first line with names makes any order of the joints' columns possible, and tells
+    the order of the root's quaternion if its names end in x, y, z and w. An archive has ``qpos``, or ``root_pos``,
+    ``root_rot`` and ``dof_pos``, and may have the frame rate and ``joint_names``. Columns that belong to no joint of
+    the character are left out.
 
     Args:
         path: The file.
@@ -61,6 +62,8 @@ def read_qpos(
     model = character_model(character)
     source = TextFile.read(path) if Path(path).suffix.lower() == ".csv" else Archive(path)
     values, names, rate = _table(source) if isinstance(source, TextFile) else _arrays(source)
+    if names and isinstance(source, TextFile):
+        quaternion, names = _root_order(source, names[:ROOT], quaternion), names[ROOT:]
     rate = frame_rate(fps, rate)
     if rate is None:
         raise source.error("has no frame rate: give it (--fps)")
@@ -82,7 +85,7 @@ def read_qpos(
 
 
 def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
-    """Read the numbers of a CSV file, and the names of the joints' columns, if the first line has names."""
+    """Read the numbers of a CSV file, and the names of all columns, if the first line has names."""
     rows = [
         (number, re.split(r"\s*[,;]\s*|\s+", line.strip().rstrip(",;")))
         for number, line in enumerate(file.text.split("\n"), start=1)
@@ -97,7 +100,21 @@ def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
         if len(words) != width:
             raise file.error(f"has {len(words)} numbers, and the first line has {width}: correct it", number)
         values.append(file.numbers(words, number))
-    return torch.tensor(values, dtype=torch.float64).view(len(values), width), names and names[ROOT:], None
+    return torch.tensor(values, dtype=torch.float64).view(len(values), width), names, None
+
+
+def _root_order(file: TextFile, names: Sequence[str], quaternion: str | None) -> str | None:
+    """Order of the root's quaternion by the names of its columns, if they end in x, y, z and w; or else the given."""
+    ends = "".join(name[-1:].lower() for name in names)
+    if ends[:3] == "xyz" and ends[3:] in ([quaternion] if quaternion else QUATERNIONS):
+        return ends[3:]
+    if set(ends) <= set("wxyz") or any(re.match(r"time|frame|index|t$", name.lower()) for name in names):
+        raise file.error(
+            f"its first {ROOT} columns are called {', '.join(names)}, which should be the root's position x, y, z and "
+            f"its quaternion {quaternion or ' or '.join(QUATERNIONS)}: correct the names, or the order of the columns",
+            1,
+        )
+    return quaternion
 
 
 def _arrays(archive: Archive) -> tuple[Tensor, list[str] | None, float | None]:

@@ -87,10 +87,10 @@ def feasibility(clip: MotionClip) -> Feasibility:
 
 
 def _limits(clip: MotionClip) -> tuple[float, str]:
-    """Greatest violation of a joint's limits, which may be negative, and the joint."""
+    """Greatest violation of a joint's limits, which may be negative, and the joint; 0 without limits."""
     model, layout = character_model(clip.character), joint_layout(clip.character)
     worst = {}
-    for joint in range(1, model.njnt):
+    for joint in np.flatnonzero(model.jnt_limited).tolist():
         low, high = model.jnt_range[joint]
         start = model.jnt_qposadr[joint]
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL:
@@ -99,12 +99,12 @@ def _limits(clip: MotionClip) -> tuple[float, str]:
         else:
             angle = clip.qpos[:, start]
             worst[layout.names[joint]] = float(torch.maximum(low - angle, angle - high).max())
-    joint_name = max(worst, key=lambda name: worst[name])
-    return max(0.0, worst[joint_name]), joint_name
+    joint_name = max(worst, key=lambda name: worst[name], default="")
+    return max(0.0, worst.get(joint_name, 0.0)), joint_name
 
 
 def _dynamics(clip: MotionClip, points: list[Tensor], grounded: list[Tensor]) -> tuple[float, str, float]:
-    """Greatest ratio of torque to the motor's limit, its joint, and the imbalance."""
+    """Greatest ratio of torque to the motor's limit, 0 without limits, its joint, and the imbalance."""
     wrench, inverse = _inverse_dynamics(clip)
     force, moment = wrench[:, :3], wrench[:, 3:]
     pressure = np.stack([-moment[:, 1], moment[:, 0]], axis=-1) / np.maximum(force[:, 2:], 1e-6)
@@ -117,7 +117,8 @@ def _dynamics(clip: MotionClip, points: list[Tensor], grounded: list[Tensor]) ->
     if not len(torque):
         return 0.0, "", 0.0
     model = character_model(clip.character)
-    ratio = np.quantile(np.abs(torque) / model.actuator_forcerange[:, 1], 0.99, axis=0)
+    strongest = np.where(model.actuator_forcelimited, model.actuator_forcerange[:, 1], np.inf)
+    ratio = np.quantile(np.abs(torque) / strongest, 0.99, axis=0)
     worst = int(ratio.argmax())
     return float(ratio[worst]), model.joint(model.actuator_trnid[worst, 0]).name, float(outside.quantile(0.95))
 

@@ -33,7 +33,7 @@ class Summary(NamedTuple):
 
 
 def summarised(clip: MotionClip) -> Summary:
-    """Summarise a clip of a character with two feet."""
+    """Summarise a clip of a character."""
     steps = clip.qpos[:, :2].diff(dim=0).norm(dim=-1)
     turns = heading(clip.qpos[:, 3:7]).diff()
     turns = torch.atan2(turns.sin(), turns.cos()).abs()
@@ -46,13 +46,15 @@ def summarised(clip: MotionClip) -> Summary:
 
 
 def foot_slide(clip: MotionClip) -> float:
-    """Median horizontal speed of an ankle while the other one swings past it, in m/s; NaN without walking.
+    """Median horizontal speed of an ankle while the other one swings past it, in m/s; NaN without walking on two feet.
 
     At that moment the foot should stand. If the rotations of a recording are read in the wrong order, it slides at 0.2
     to 1 m/s.
     """
     names, bodies = body_names(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet]
+    if len(feet) < 2:
+        return float("nan")
     speeds = bodies.linear_velocities[:, feet, :2].norm(dim=-1)
     apart = (bodies.positions[:, feet[0], :2] - bodies.positions[:, feet[1], :2]).norm(dim=-1)
     walking = (speeds.amax(-1) > SWINGING) & (bodies.linear_velocities[:, 0, :2].norm(dim=-1) < RUNNING)

@@ -14,10 +14,11 @@ GAINS = 'kp="80" kv="7" ctrlrange="-1 1"'
 BODY = """
 <mujoco>
   <option timestep="0.008333333333"/>
+  {default}
   <worldbody>{scenery}
     <body name="root" pos="0 0 {height}">{root}
       <geom type="{shape}" size="0.1 0.1 0.1" contype="{contype}"/>
-      <body name="left_leg" pos="0 0.1 0">{joint}
+      <body name="left_leg" pos="0 0.1 0" {turn}>{joint}
         <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.05" contype="0"/>
       </body>
       <body name="{right}" pos="0 -0.1 0"><joint name="{right}"/>
@@ -29,7 +30,9 @@ BODY = """
 </mujoco>
 """
 GOOD = {
+    "default": "",
     "scenery": "",
+    "turn": "",
     "height": 0.55,
     "root": "<freejoint/>",
     "shape": "sphere",
@@ -68,6 +71,13 @@ WRONG = {
     "slide": ({"joint": '<joint name="left_leg" type="slide"/>'}, "neither a hinge nor a ball"),
     "limits": ({"joint": '<joint name="left_leg" range="10 50"/>'}, "left_leg rests beyond the limits"),
     "twin": ({"right": "right_arm"}, "has no twin on the other side"),
+    "turned": ({"turn": 'euler="0 0 90"'}, "the frames of left_leg, right_leg are no mirror images"),
+    "oblique": ({"turn": 'euler="0 0 45"'}, "the frames of left_leg, right_leg are no mirror images"),
+    "tilted hinge": (
+        {"joint": '<joint name="left_leg" axis="0 1 1"/>'},
+        "the frames of left_leg, right_leg are no mirror images",
+    ),
+    "defaults": ({"default": '<default><geom condim="1"/></default>'}, "has defaults of geom in no class"),
 }
 
 
@@ -88,6 +98,12 @@ def test_a_small_character_keeps_it():
 @pytest.mark.parametrize(("changes", "said"), WRONG.values(), ids=WRONG)
 def test_each_violation_is_said_with_its_remedy(changes, said):
     assert any(said in violation and ": " in violation for violation in found(**changes)), found(**changes)
+
+
+def test_defaults_of_a_class_change_no_scene():
+    body = BODY.format(**GOOD | {"default": '<default><default class="own"><geom condim="1"/></default></default>'})
+    spec = mujoco.MjSpec.from_string(body.replace('<body name="root"', '<body name="root" childclass="own"'))
+    assert violations(spec, feet=["left_leg", "right_leg"]) == []
 
 
 @pytest.mark.parametrize(("feet", "said"), [((), "no feet are named"), (("hoof",), "feet names hoof, which it lacks")])

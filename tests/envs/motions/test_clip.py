@@ -12,6 +12,7 @@ from torchrl_mcp.envs.characters.kinematics import body_names, body_states
 from torchrl_mcp.envs.characters.sides import twin
 from torchrl_mcp.envs.motions.clip import MotionClip, concatenated, differences
 from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.rotations import about_z, heading
 
 
@@ -23,6 +24,8 @@ def random_clip(character="humanoid", *, frames=7, fps=10.0, loop=False, seed=0)
     for step in steps:
         qpos.append(qpos[-1].copy())
         mujoco.mj_integratePos(model, qpos[-1], step, 1.0)
+    if loop:
+        qpos[-1][7:] = qpos[0][7:]
     return MotionClip(character, torch.from_numpy(np.stack(qpos)), fps, loop), torch.from_numpy(steps)
 
 
@@ -281,3 +284,11 @@ def test_a_file_that_would_fill_the_memory_is_refused_before_it_is_unpacked(tmp_
     monkeypatch.setattr(np, "load", lambda *arguments, **settings: pytest.fail("it was unpacked"))
     with pytest.raises(MotionFormatError, match="would unpack to"):
         MotionClip.load(bomb)
+
+
+def test_a_loop_must_end_as_it_began():
+    walk = stride("humanoid", 1.0, 0.0, strides=1)
+    half = walk.qpos[: len(walk.qpos) // 2]
+    assert not MotionClip("humanoid", half, walk.fps).loop
+    with pytest.raises(ValueError, match=r"ends with a joint \d\.\d+ rad from where it began: pass loop=False"):
+        MotionClip("humanoid", half, walk.fps, loop=True)

@@ -86,12 +86,14 @@ def test_the_digest_changes_with_everything_that_is_read(clips, library):
     curve, turn = clips["curve"], clips["turn"]
     changed = curve.qpos.clone()
     changed[5, 7] += 1e-12
+    cycle = replace(curve, qpos=torch.cat([curve.qpos, curve.qpos[:1]]))
     others = [
         MotionLibrary({"curve": curve}),
         MotionLibrary({"turn": turn, "curve": curve}),
         MotionLibrary({"curve": replace(curve, qpos=changed), "turn": turn}),
         MotionLibrary({"curve": replace(curve, fps=30.0), "turn": turn}),
-        MotionLibrary({"curve": replace(curve, loop=True), "turn": turn}),
+        MotionLibrary({"curve": cycle, "turn": turn}),
+        MotionLibrary({"curve": replace(cycle, loop=True), "turn": turn}),
         MotionLibrary(clips, {"curve": 1.0, "turn": 1.0}),
     ]
     assert len({library.digest, *(other.digest for other in others)}) == 1 + len(others)

@@ -13,7 +13,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.placement import Placement
-from torchrl_mcp.envs.tasks.imitation import ERRORS
+from torchrl_mcp.envs.tasks.imitation_reward import ERRORS
 
 every_character = pytest.mark.parametrize("character", CHARACTERS)
 TERMS = {"pose": {"weight": 0.6, "scale": 3.0}, "root_pose": {"weight": 0.4, "scale": 5.0}}
@@ -241,6 +241,20 @@ def test_motions_and_terms_are_checked():
         make(terms={"posture": {"weight": 1.0, "scale": 1.0}})
     with pytest.raises(ValueError, match="switch_interval=0"):
         make(switch_interval=0)
+
+
+@pytest.mark.parametrize(
+    ("terms", "said"),
+    [
+        ({}, "terms are empty"),
+        ({"pose": {"weight": 1.0, "scales": 2.0}}, "the term pose has weight, scales: pass weight and scale"),
+        ({"pose": {"weight": -1.0, "scale": 2.0}}, "terms.pose.weight=-1.0 is out of range"),
+        ({"pose": {"weight": 1.0, "scale": -50.0}}, "terms.pose.scale=-50.0 is out of range"),
+    ],
+)
+def test_terms_that_are_no_reward_are_refused(terms, said):
+    with pytest.raises(ValueError, match=said):
+        make(terms=terms)
 
 
 def test_the_best_possible_return_is_one():

@@ -11,7 +11,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.placement import Placement
-from torchrl_mcp.envs.tasks.imitation import ERRORS
+from torchrl_mcp.envs.tasks.imitation_reward import ERRORS
 
 
 def follower(character):

@@ -88,6 +88,23 @@ def test_columns_with_names_may_have_any_order_and_others_between_them(clips, tm
     assert_same(import_motion(path, character, fps=clip.fps, rate=clip.fps), clip)
 
 
+def test_names_of_the_roots_columns_tell_the_order_of_its_quaternion(clips, tmp_path):
+    clip, path = clips["humanoid"], tmp_path / "motion.csv"  # it faces along x: upright in both orders
+    header = ["root_x", "root_y", "root_z", "root_qx", "root_qy", "root_qz", "root_qw", *owners("humanoid")]
+    path.write_text(table(reordered(clip), header))
+    assert_same(import_motion(path, "humanoid", fps=clip.fps, rate=clip.fps), clip)
+    with pytest.raises(MotionFormatError, match=r"root_qx, root_qy, root_qz, root_qw, which should be .* wxyz"):
+        import_motion(path, "humanoid", fps=clip.fps, quaternion="wxyz")
+
+
+@pytest.mark.parametrize("root", [("time", "x", "y", "z", "qw", "qx", "qy"), ("qw", "qx", "qy", "qz", "x", "y", "z")])
+def test_names_that_are_not_the_roots_are_refused(clips, tmp_path, root):
+    clip, path = clips["biped"], tmp_path / "motion.csv"
+    path.write_text(table(clip.qpos, [*root, *owners("biped")]))
+    with pytest.raises(MotionFormatError, match=rf":1: .*columns are called {', '.join(root)}"):
+        import_motion(path, "biped", fps=clip.fps, quaternion="wxyz")
+
+
 def test_joints_may_be_named_by_the_user(clips, tmp_path):
     clip, path = clips["trex"], tmp_path / "motion.csv"
     names = clip.layout.names[1:]

@@ -1,4 +1,7 @@
 import math
+import re
+from dataclasses import replace
+from importlib.resources import files
 
 import pytest
 import torch
@@ -117,3 +120,15 @@ def test_generated_walking_is_within_a_bodys_means(character):
     assert found.torque < 1
     assert found.airborne == 0
     assert found.imbalance < 0.06
+
+
+def test_joints_and_motors_without_limits_exceed_none(tmp_path, monkeypatch):
+    text = files("torchrl_mcp.envs.characters").joinpath("biped.xml").read_text()
+    free = re.sub(r' (range|forcerange)="[^"]*"', "", text)
+    (tmp_path / "free.xml").write_text(free)
+    monkeypatch.setitem(CHARACTERS, "free", replace(CHARACTERS["biped"], name="free", file=tmp_path / "free.xml"))
+    model = character_model("free")
+    assert not model.jnt_limited.any()
+    assert not model.actuator_forcelimited.any()
+    found = feasibility(posed("free"))
+    assert (found.limit, found.limit_joint, found.torque) == (0.0, "", 0.0)

@@ -5,9 +5,9 @@ import torch
 
 from torchrl_mcp.envs import Carry, Curriculum, Dribble, Heading, Location
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.initial_states import InitialStates
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.envs.rotations import heading
-from torchrl_mcp.envs.tasks.initial_states import InitialStates
 
 MIXED = {"rest": 1.0, "motions": 3.0}
 

@@ -1,0 +1,68 @@
+"""A task of one's own: what the base class does for it, and mistakes that it names."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_mcp.envs import Carry, Heading, Location, PDCharacterEnv
+from torchrl_mcp.envs.motions.single import single_motion
+
+
+class Stand(PDCharacterEnv):
+    """Nothing to do."""
+
+    def __init__(self, num_envs=3, *, finished=True, **kwargs):
+        super().__init__("biped", num_envs, max_episode_steps=10, seed=0, num_threads=1, **kwargs)
+        if finished:
+            self.make_specs()
+
+    def observe(self, ids):
+        return {"observation": self.see(ids)[0], "goal": self.com[ids, :0]}
+
+    def reward(self):
+        return torch.ones(self.num_envs, dtype=torch.float64)
+
+
+def step(env):
+    return env.step(env.reset().set("action", torch.zeros(env.action_spec.shape)))["next"]
+
+
+def test_a_curriculum_lets_its_episodes_begin_in_motion():
+    moving = Stand(curriculum={"initial_states": "motions", "motions": single_motion("biped")})
+    moving.reset()
+    assert (moving.get_state()["qvel"].norm(dim=-1) > 0.5).all()
+    resting = Stand()
+    resting.reset()
+    assert not resting.get_state()["qvel"].any()
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "said"),
+    [
+        ({"initial_states": "nonsense"}, "initial_states='nonsense' is unknown"),
+        ({"mixture": [{"weight": 1.0}]}, "mixture is for ranges, and Stand draws from none: leave it out"),
+    ],
+)
+def test_a_curriculum_without_effect_is_refused(curriculum, said):
+    with pytest.raises(ValueError, match=said):
+        Stand(curriculum=curriculum)
+
+
+@pytest.mark.parametrize("method", ["reward", "terminated"])
+def test_a_reward_or_an_end_of_another_shape_is_named(method):
+    wrong = type("Wrong", (Stand,), {method: lambda self: torch.zeros(self.num_envs, 1, dtype=torch.bool)})
+    with pytest.raises(ValueError, match=rf"Wrong\.{method}\(\) has shape \(3, 1\): return \(3,\)"):
+        step(wrong())
+
+
+def test_forgotten_specs_are_named():
+    with pytest.raises(RuntimeError, match=r"Stand has no specs: call make_specs\(\)"):
+        Stand(finished=False).reset()
+
+
+@pytest.mark.parametrize("task", [Carry, Heading, Location])
+def test_a_reset_of_no_simulation_changes_nothing(task):
+    env = task("biped", 2, seed=0, num_threads=1)
+    before = env.reset()
+    after = env.reset(TensorDict({**before, "_reset": torch.zeros(2, 1, dtype=torch.bool)}, [2]))
+    assert all(torch.equal(after[key], before[key]) for key in ("observation", "goal", "done"))
