@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
 from torchrl_mcp.envs.characters.kinematics import BodyStates, origin_velocities
 from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_state, require_mirror_images
@@ -22,9 +23,6 @@ from torchrl_mcp.envs.observations import character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
 from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
-
-CONTROL_TIMESTEP = 1 / 30
-"""Seconds per action."""
 
 TASK_REWARD = "task_reward"
 """Key of the task's own reward in environments that train with another."""

@@ -31,7 +31,7 @@ ROOMS = (
     {"characters"},
     {"rendering"},
     {"motions"},
-    {"observations", "ideal", "curriculum"},
+    {"observations", "ideal", "curriculum", "initial_states"},
     {"base"},
     {"pd_character"},
     {"tasks"},

@@ -6,7 +6,16 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from torchrl_mcp.envs.characters.contract import BALL, FREE, HINGE, colliding, joints_of, kinds_of, lowest_bodies
+from torchrl_mcp.envs.characters.contract import (
+    BALL,
+    FREE,
+    HINGE,
+    colliding,
+    joints_of,
+    kinds_of,
+    line_of,
+    lowest_bodies,
+)
 from torchrl_mcp.envs.characters.drives import TIMESTEP, Drive, drive, load, matched
 from torchrl_mcp.envs.characters.pose import FREE_RANGE, Pose
 from torchrl_mcp.envs.characters.sides import Sides, guessed_sides
@@ -83,7 +92,7 @@ def adapted(
     """
     trunk = _root(model, root)
     names = {
-        body: model.body(body).name or f"body_{body}" for body in range(1, model.nbody) if trunk in _line(model, body)
+        body: model.body(body).name or f"body_{body}" for body in range(1, model.nbody) if trunk in line_of(model, body)
     }
     _require_convertible(model, names)
     rest = Pose.read(model, pose, list(names))
@@ -103,7 +112,7 @@ def adapted(
         guessed_sides(names.values()) if sides is None else sides,
         drives,
         {name: (spec.joint(name).range[0], spec.joint(name).range[1]) for name in drives},
-        tuple(model.body(body).name for body in _roots(model) if body not in _line(model, trunk)),
+        tuple(model.body(body).name for body in _roots(model) if body not in line_of(model, trunk)),
     )
 
 
@@ -160,14 +169,6 @@ def key_bodies(model: mujoco.MjModel) -> list[str]:
 def _roots(model: mujoco.MjModel) -> list[int]:
     """Bodies that hang on the world."""
     return (np.flatnonzero(model.body_parentid[1:] == 0) + 1).tolist()
-
-
-def _line(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and those on which it hangs."""
-    line = [body]
-    while line[-1]:
-        line.append(int(model.body_parentid[line[-1]]))
-    return line
 
 
 def _root(model: mujoco.MjModel, name: str | None) -> int:

@@ -110,6 +110,14 @@ def joints_of(model: mujoco.MjModel, body: int) -> list[int]:
     return list(range(first, first + model.body_jntnum[body]))
 
 
+def line_of(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return a body and those on which it hangs, up to the world."""
+    line = [body]
+    while line[-1]:
+        line.append(int(model.body_parentid[line[-1]]))
+    return line
+
+
 def kinds_of(model: mujoco.MjModel, body: int) -> list[int]:
     """Return the kinds of the joints of a body."""
     return [int(model.jnt_type[joint]) for joint in joints_of(model, body)]

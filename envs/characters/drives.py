@@ -7,7 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from torchrl_mcp.envs.characters.contract import joints_of
+from torchrl_mcp.envs.characters.contract import joints_of, line_of
 
 TIMESTEP = 1 / 120
 """Seconds of a physics step."""
@@ -128,7 +128,7 @@ def load(model: mujoco.MjModel, body: int, feet: Sequence[int]) -> Load:
     least = LEAST * gravity * total * float(data.xpos[1, 2])
     anchor, beyond, rest = data.xanchor[joints_of(model, body)[0]], data.subtree_com[body], max(total - mass, 1e-9)
     behind = (total * data.subtree_com[1] - mass * beyond) / rest
-    own = [foot for foot in feet if _within(model, foot, body)]
+    own = [foot for foot in feet if body in line_of(model, foot)]
     if not own or len(own) == len(feet):
         centre, weight = (beyond, mass) if mass < rest else (behind, rest)
         return Load(max(HOLDING * gravity * weight * float(np.linalg.norm(centre - anchor)), least), 0.0)
@@ -208,13 +208,6 @@ def _chosen(given: float | None, own: float, guess: float) -> tuple[float, str]:
     if given is not None:
         return given, GIVEN
     return (own, FILE) if own else (guess, GUESSED)
-
-
-def _within(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
-    """Whether a body is another one or hangs on it."""
-    while body > ancestor:
-        body = model.body_parentid[body]
-    return bool(body == ancestor)
 
 
 def _reach(model: mujoco.MjModel, data: mujoco.MjData, foot: int, anchor: np.ndarray) -> float:

@@ -10,12 +10,8 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.characters.mirror import Mirror
-from torchrl_mcp.envs.ideal import Reach, transport_reach
-from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import about_z, heading, inverse, multiply, rotate
-from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
+from torchrl_mcp.envs.tasks.rewards import transport_reward
 from torchrl_mcp.envs.tasks.tables import (
     CLEARANCE,
     GAP,
@@ -29,16 +25,13 @@ from torchrl_mcp.envs.tasks.tables import (
 )
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
-    goal_layout,
-    goal_mirror,
     goal_of,
     horizontal_extent,
     mocap_positions,
     placement,
     places,
-    pointers,
-    require_transport,
 )
+from torchrl_mcp.envs.tasks.transport_env import Transport
 from torchrl_mcp.envs.tasks.waypoints import carry_waypoint, place_seen
 
 OBJECTS = {"target": 7, "source": 7, "box": 13}
@@ -57,7 +50,7 @@ carry_reward = partial(transport_reward, weights=(0.1, 0.2, 0.3, 0.4), proximity
 and the speed of the box towards the target and its distance from the target."""
 
 
-class Carry(PDCharacterEnv):
+class Carry(Transport):
     """A character takes a box from a source table to a target table.
 
     The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
@@ -117,7 +110,9 @@ class Carry(PDCharacterEnv):
         torch.Size([2, 3, 27])
     """
 
-    num_reward_terms = 4
+    objects = OBJECTS
+    reward_of = staticmethod(carry_reward)
+    success_distance = TOP_HALF_SIZE
 
     def __init__(
         self,
@@ -136,13 +131,14 @@ class Carry(PDCharacterEnv):
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
-        require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
-        self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
-        self.goal_positions, self.waypoint = goal_positions, waypoint
-        self.goal_layout = goal_layout(OBJECTS, waypoint)
         super().__init__(
             character,
             num_envs,
+            speed=speed,
+            target_distance_power=target_distance_power,
+            success_reward=success_reward,
+            goal_positions=goal_positions,
+            waypoint=waypoint,
             furnish=self._furnish,
             model_fields=["eq_data"],
             max_episode_steps=max_episode_steps,
@@ -168,7 +164,8 @@ class Carry(PDCharacterEnv):
         self._gaps = outputs["sensordata"][:, gaps[0] : gaps[-1] + 1]
         self._joined, self._joint = state["eq_active"][:, weld], state["eq_data"][:, weld, 3:10]
         self._source_height = state["mocap_pos"][:, 1, 2]
-        self.track(object=self._box[0])
+        self._object, self._target = self._box[0], self._tables["target"][0]
+        self.track(object=self._object)
         self.make_specs()
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
@@ -213,7 +210,7 @@ class Carry(PDCharacterEnv):
         state, objects = self.see(ids)
         return {
             "observation": state,
-            "goal": goal_of(objects, OBJECTS, self.goal_positions, *self._waypoints(ids)),
+            "goal": goal_of(objects, self.objects, self.goal_positions, *self._waypoints(ids)),
             "success": self.success()[ids].unsqueeze(-1),
             "box_taken": self.episode["taken"][ids].bool().unsqueeze(-1),
         }
@@ -226,55 +223,12 @@ class Carry(PDCharacterEnv):
         taken, held = self.episode["taken"] == 1, self._joined == 1
         return [place_seen(self, carry_waypoint(com, box, target, taken, held), ids)]
 
-    def reward(self) -> Tensor:
-        """Reward of appendix D, or 1 while successful."""
-        reward = carry_reward(*self._motion(), speed=self.speed, target_distance_power=self.target_distance_power)
-        return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
-
-    def training_reward(self) -> Tensor:
-        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        aids, weights = self.curriculum, self.curriculum.reward_weights
-        assert weights is not None
-        power, speed = aids.target_distance_power, self.speed
-        reward = carry_reward(*self._motion(), weights=weights, speed=speed, target_distance_power=power)
-        return training_reward(reward, self.success(), weights=weights, speed=speed, discount=aids.discount)
-
-    def terminated(self) -> Tensor:
-        """A success, if it ends the episode."""
-        return self.success() if self.curriculum.ends_at_success else super().terminated()
-
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
         put_down = (self.episode["taken"] == 1) & (self._joined == 0)
         success = torch.zeros_like(put_down)
         success[self._over(put_down, "target", RESTING_GAP)] = True
         return success
-
-    def reach(self) -> Reach:
-        """Returns of standing still, and of an ideal player that takes the box straight to its target."""
-        com, _, box, _, target = self._motion()
-        return transport_reach(
-            partial(carry_reward, speed=self.speed, target_distance_power=self.target_distance_power),
-            *(place.clone() for place in (com, box, target)),
-            speed=self.speed,
-            timestep=self.control_timestep,
-            num_steps=self.max_episode_steps,
-            success_distance=TOP_HALF_SIZE if self.success_reward else 0.0,
-        )
-
-    def goal_mirror(self) -> Mirror:
-        """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return goal_mirror(OBJECTS, self.waypoint)
-
-    def arrows(self, index: int) -> list[Arrow]:
-        """Arrows from above the character to the box, and from above the box to the target."""
-        return pointers(self.com[index], self._box[0][index], self._tables["target"][0][index])
-
-    def _motion(self) -> tuple[Tensor, ...]:
-        """Horizontal centre of mass, its velocity, place and velocity of the box, and the target, each ``(N, 2)``."""
-        box, target = self._box[0], self._tables["target"][0]
-        parts = (self.com, self.velocity("com"), box, self.velocity("object"), target)
-        return tuple(part[:, :2] for part in parts)
 
     def _over(self, candidates: Tensor, table: str, gap: float) -> Tensor:
         """Simulations among ``candidates``, ``(N,)`` bool, in which the box is over a table, ``(n,)``.

@@ -9,26 +9,19 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from torchrl_mcp.envs.characters.mirror import Mirror
-from torchrl_mcp.envs.ideal import Reach, transport_reach
-from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
+from torchrl_mcp.envs.tasks.rewards import transport_reward
 from torchrl_mcp.envs.tasks.transport import (
     ANY_DIRECTION,
     SUCCESS_DISTANCE,
     SUCCESS_REACH,
-    goal_layout,
-    goal_mirror,
     goal_of,
     horizontal_extent,
     mocap_positions,
     near,
     placement,
     places,
-    pointers,
-    require_transport,
 )
+from torchrl_mcp.envs.tasks.transport_env import Transport
 from torchrl_mcp.envs.tasks.waypoints import dribble_waypoint, place_seen
 
 OBJECTS = {"target": 3, "ball": 13}
@@ -58,7 +51,7 @@ dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximi
 and the speed of the ball towards the target and its distance from the target."""
 
 
-class Dribble(PDCharacterEnv):
+class Dribble(Transport):
     """A character moves a ball to a target.
 
     ``goal`` (16) is the position of the target, and position, orientation, linear and angular velocity of the ball, in
@@ -107,7 +100,9 @@ class Dribble(PDCharacterEnv):
         torch.Size([2, 3, 16])
     """
 
-    num_reward_terms = 4
+    objects = OBJECTS
+    reward_of = staticmethod(dribble_reward)
+    success_distance = SUCCESS_DISTANCE
 
     def __init__(
         self,
@@ -126,11 +121,18 @@ class Dribble(PDCharacterEnv):
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
-        require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)
-        self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
-        self.goal_positions, self.waypoint = goal_positions, waypoint
-        self.goal_layout = goal_layout(OBJECTS, waypoint)
-        super().__init__(character, num_envs, furnish=add_pitch, max_episode_steps=max_episode_steps, **kwargs)
+        super().__init__(
+            character,
+            num_envs,
+            speed=speed,
+            target_distance_power=target_distance_power,
+            success_reward=success_reward,
+            goal_positions=goal_positions,
+            waypoint=waypoint,
+            furnish=add_pitch,
+            max_episode_steps=max_episode_steps,
+            **kwargs,
+        )
         self.ranges = placement(
             self.curriculum.mixture,
             object_distances=object_distances,
@@ -145,8 +147,8 @@ class Dribble(PDCharacterEnv):
         self.ranges.to(self.device)
         # Live views, made once.
         self._marks = mocap_positions(self.simulation.model).to(self.device)
-        self._ball, self._target = self.pose("ball")[0], self.pose("target")[0]
-        self.track(object=self._ball)
+        self._object, self._target = self.pose("ball")[0], self.pose("target")[0]
+        self.track(object=self._object)
         self.make_specs()
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
@@ -160,7 +162,7 @@ class Dribble(PDCharacterEnv):
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and where it sees target and ball."""
         state, objects = self.see(ids)
-        goal = goal_of(objects, OBJECTS, self.goal_positions, *self._waypoints(ids))
+        goal = goal_of(objects, self.objects, self.goal_positions, *self._waypoints(ids))
         return {"observation": state, "goal": goal, "success": self.success()[ids].unsqueeze(-1)}
 
     def _waypoints(self, ids: Tensor | slice) -> list[Tensor]:
@@ -171,51 +173,9 @@ class Dribble(PDCharacterEnv):
         velocity = self.simulation.state["qvel"][:, -6:-4]  # the last step's is not known after a reset
         return [place_seen(self, dribble_waypoint(com, ball, velocity, target), ids)]
 
-    def reward(self) -> Tensor:
-        """Reward of appendix D, or 1 while successful."""
-        reward = dribble_reward(*self._motion(), speed=self.speed, target_distance_power=self.target_distance_power)
-        return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
-
-    def training_reward(self) -> Tensor:
-        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
-        aids, weights = self.curriculum, self.curriculum.reward_weights
-        assert weights is not None
-        power, speed = aids.target_distance_power, self.speed
-        reward = dribble_reward(*self._motion(), weights=weights, speed=speed, target_distance_power=power)
-        return training_reward(reward, self.success(), weights=weights, speed=speed, discount=aids.discount)
-
-    def terminated(self) -> Tensor:
-        """A success, if it ends the episode."""
-        return self.success() if self.curriculum.ends_at_success else super().terminated()
-
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
-        return near(self._ball, self._target, SUCCESS_DISTANCE) & near(self.com, self._ball, SUCCESS_REACH)
-
-    def reach(self) -> Reach:
-        """Returns of standing still, and of an ideal player that takes the ball straight to its target."""
-        com, _, ball, _, target = self._motion()
-        return transport_reach(
-            partial(dribble_reward, speed=self.speed, target_distance_power=self.target_distance_power),
-            *(place.clone() for place in (com, ball, target)),
-            speed=self.speed,
-            timestep=self.control_timestep,
-            num_steps=self.max_episode_steps,
-            success_distance=SUCCESS_DISTANCE if self.success_reward else 0.0,
-        )
-
-    def goal_mirror(self) -> Mirror:
-        """See :meth:`PDCharacterEnv.goal_mirror`."""
-        return goal_mirror(OBJECTS, self.waypoint)
-
-    def arrows(self, index: int) -> list[Arrow]:
-        """Arrows from above the character to the ball, and from above the ball to the target."""
-        return pointers(self.com[index], self._ball[index], self._target[index])
-
-    def _motion(self) -> tuple[Tensor, ...]:
-        """Horizontal centre of mass, its velocity, place and velocity of the ball, and the target, each ``(N, 2)``."""
-        parts = (self.com, self.velocity("com"), self._ball, self.velocity("object"), self._target)
-        return tuple(part[:, :2] for part in parts)
+        return near(self._object, self._target, SUCCESS_DISTANCE) & near(self.com, self._object, SUCCESS_REACH)
 
 
 def add_pitch(spec: mujoco.MjSpec) -> None:

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import interval, not_negative, positive
+from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.joints import joint_layout
 from torchrl_mcp.envs.characters.mirror import Mirror, mirror_bodies
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
 from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.observations import bodies_in_heading_frame
-from torchrl_mcp.envs.pd_character import CONTROL_TIMESTEP, PDCharacterEnv
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
 from torchrl_mcp.envs.tasks.imitation_reward import (
     checked_terms,

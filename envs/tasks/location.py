@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative, positive
-from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
@@ -178,7 +177,7 @@ class Location(PDCharacterEnv):
         """The place relative to the centre of mass, ``(N, 2)``, in metres."""
         return self.episode["target"] - self.com[:, :2]
 
-    def _alignment(self, ids: Tensor | slice = ALL) -> Tensor:
-        """Cosine of the angle between heading and direction to face, 1 if any will do, ``(n,)``."""
-        angle = self.episode["final_direction"][ids] - self.heading(ids)
-        return angle.cos() if self.faces else torch.ones_like(angle)
+    def _alignment(self) -> Tensor:
+        """Cosine of the angle between heading and direction to face, 1 if any will do, ``(N,)``."""
+        heading = self.heading()
+        return (self.episode["final_direction"] - heading).cos() if self.faces else torch.ones_like(heading)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.contract import line_of
 from torchrl_mcp.envs.characters.joints import character_model
 
 FURTHEST = 1.0
@@ -43,19 +44,11 @@ def legs_apart(character: str, qpos: Tensor) -> Tensor:
 
 def _leg_shapes(model: mujoco.MjModel, foot: int, other: int) -> list[int]:
     """Colliding shapes of the leg of a foot: all that hangs on the first body that does not carry another foot."""
-    trunk = _line(model, other)
-    bodies = {next(body for body in reversed(_line(model, foot)) if body not in trunk)} if foot not in trunk else set()
+    trunk, leg = line_of(model, other), reversed(line_of(model, foot))
+    bodies = {next(body for body in leg if body not in trunk)} if foot not in trunk else set()
     for body in range(model.nbody):
         if model.body_parentid[body] in bodies:
             bodies.add(body)
     return [
         shape for shape in range(model.ngeom) if model.geom_bodyid[shape] in bodies and model.geom_conaffinity[shape]
     ]
-
-
-def _line(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and those on which it hangs."""
-    line = [body]
-    while line[-1]:
-        line.append(int(model.body_parentid[line[-1]]))
-    return line
