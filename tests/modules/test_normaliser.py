@@ -66,17 +66,6 @@ def test_updates_are_in_place():
     assert {name: buffer.data_ptr() for name, buffer in normaliser.named_buffers()} == storages
 
 
-def test_it_stops_learning_at_max_count():
-    normaliser = RunningNormaliser(2, max_count=15)
-    normaliser.update(torch.randn(10, 2))
-    normaliser.update(torch.randn(10, 2))
-    before = {name: buffer.clone() for name, buffer in normaliser.named_buffers()}
-    assert before["count"] == 20
-    normaliser.update(torch.randn(10, 2) + 100)
-    for name, buffer in normaliser.named_buffers():
-        assert torch.equal(buffer, before[name]), name
-
-
 def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
     normaliser = RunningNormaliser(2)
     x = torch.randn(5, 2, requires_grad=True)

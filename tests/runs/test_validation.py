@@ -52,6 +52,14 @@ def test_settings_of_a_method_hold_in_the_stage_that_they_name():
     assert composed(*place("scratch", "dribble")).training.minibatch_size == 512
 
 
+@pytest.mark.parametrize("word", ["step_size.actor=0.1", "step_size.actor=1e-6", "step_size.max=2e-5"])
+def test_a_step_size_that_the_first_update_would_replace_is_refused(word):
+    with pytest.raises(
+        ValueError, match=r"step_size\.actor=\S+ is beyond .*schedule\.min_lr.*\(step_size\.max\): change one"
+    ):
+        configuration.require_valid(composed(*place("mcp", "heading"), word))
+
+
 WRONG = {
     "seed": ["null", "-1", "1.5", "many", str(2**32)],
     "training.num_envs": ["0", "1.5", "null", "-4", "[1]"],

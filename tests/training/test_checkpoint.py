@@ -14,6 +14,7 @@ from torchrl import torchrl_logger
 from torchrl_mcp.training.checkpoint import (
     RunRandomness,
     find,
+    is_intact,
     load,
     load_parts,
     rotation,
@@ -129,6 +130,27 @@ def test_where_a_tensor_finds_no_room_the_system_s_error_names_the_checkpoint_an
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [path.name for path in checkpoints.directory.iterdir()] == ["checkpoint-000000000100.torchrl"]
     load_parts(parts, ["gating"], find(tmp_path))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits open files as Linux does")
+def test_where_the_system_has_no_more_files_an_intact_checkpoint_is_not_called_damaged(saved_run):
+    import resource
+
+    path, limits = find(saved_run), resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest = os.dup(0)
+    os.close(lowest)
+    for ask in (
+        is_intact,
+        saved_config,
+        lambda path: load_parts(nn.ModuleDict({"gating": nn.Linear(1, 1)}), ["gating"], path),
+    ):
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
+            with pytest.raises(OSError, match="Too many open files"):
+                ask(path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert is_intact(path)
 
 
 @pytest.mark.parametrize("place", [".", "absent", "temporary"])

@@ -1,6 +1,5 @@
 """Running normalisation of network inputs."""
 
-import math
 import warnings
 
 import torch
@@ -21,7 +20,6 @@ class RunningNormaliser(nn.Module):
     Args:
         size: Number of input features, ``F``.
         clip: Largest absolute output, :math:`c`.
-        max_count: Number of samples after which the statistics no longer change.
         epsilon: Added to the variance.
 
     Raises:
@@ -38,14 +36,13 @@ class RunningNormaliser(nn.Module):
     variance: Tensor
     count: Tensor
 
-    def __init__(self, size: int, *, clip: float = 10.0, max_count: float = math.inf, epsilon: float = 1e-8) -> None:
+    def __init__(self, size: int, *, clip: float = 10.0, epsilon: float = 1e-8) -> None:
         super().__init__()
         if size < 1:
             raise ValueError(f"size must be a positive number of features, got {size}")
         if clip <= 0:
             raise ValueError(f"clip must be positive, got {clip}")
         self.clip = clip
-        self.max_count = max_count
         self.epsilon = epsilon
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("variance", torch.ones(size))
@@ -65,8 +62,6 @@ class RunningNormaliser(nn.Module):
         Reference:
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
         """
-        if self.count >= self.max_count:
-            return
         x = x.reshape(-1, x.shape[-1])
         if not (within := (x.abs() <= LARGEST).all(-1)).all():
             warnings.warn(f"{int((~within).sum())} of {len(x)} samples have features beyond {LARGEST:g}", stacklevel=2)

@@ -3,6 +3,7 @@
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.objectives.value import GAE
 
 
@@ -52,12 +53,16 @@ class Advantages:
         trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
         self.gae(trajectories)
 
-        advantage = trajectories["advantage"]
-        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
-        batch["advantage"] = advantage.clamp(-self.clip, self.clip)
+        batch["advantage"] = normalised(trajectories["advantage"], self.clip)
         batch["value_target"] = trajectories["value_target"]
         batch["state_value"] = value
         return batch
+
+
+def normalised(advantage: Tensor, clip: float) -> Tensor:
+    """Scale advantages of a batch to zero mean and unit variance, and clip them; a single one becomes 0."""
+    deviation = advantage.std(correction=min(1, advantage.numel() - 1))
+    return ((advantage - advantage.mean()) / deviation.clamp_min(1e-8)).clamp(-clip, clip)
 
 
 def reward_scale(gamma: float) -> float:

@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.value import GAE
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
-from torchrl_mcp.objectives.advantages import reward_scale
+from torchrl_mcp.objectives.advantages import normalised, reward_scale
 from torchrl_mcp.objectives.values import ValueLoss
 
 
@@ -84,9 +84,7 @@ class OptionAdvantages:
         trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
         self.gae(trajectories)
 
-        advantage = trajectories["advantage"]
-        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-8)
-        batch["advantage"] = advantage.clamp(-self.clip, self.clip)
+        batch["advantage"] = normalised(trajectories["advantage"], self.clip)
         batch["value_target"] = trajectories["value_target"]
         regret = (kept - chosen) / self.reward_scale + self.termination_cost
         batch["termination_advantage"] = regret * ~batch["next", "terminated"]

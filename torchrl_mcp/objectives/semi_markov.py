@@ -5,7 +5,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_mcp.objectives.advantages import reward_scale
+from torchrl_mcp.objectives.advantages import normalised, reward_scale
 
 
 class SemiMarkovAdvantages:
@@ -62,9 +62,7 @@ class SemiMarkovAdvantages:
         target = self._targets(batch, value)
 
         choices = batch[begins]
-        advantage = (target - value)[begins]
-        advantage = (advantage - advantage.mean()) / advantage.std(correction=0).clamp_min(1e-8)
-        choices["advantage"] = advantage.clamp(-self.clip, self.clip).unsqueeze(-1)
+        choices["advantage"] = normalised((target - value)[begins], self.clip).unsqueeze(-1)
         choices["value_target"] = target[begins].unsqueeze(-1)
         choices["state_value"] = value[begins].unsqueeze(-1)
         return choices

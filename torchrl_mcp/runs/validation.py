@@ -145,10 +145,22 @@ def require_valid(config: Mapping[str, Any]) -> None:
             wrong.append(f"{path} is needed: pass {path}=...")
         elif (rule := _rule(path)) and not rule.allows(value):
             wrong.append(f"{path}={_shown(value)} must be {rule.words}")
+    if not wrong and (schedule := config["optimizer"].get("schedule")):
+        wrong += _step_size_beyond(config["step_size"]["actor"], schedule)
     if not wrong and _escapes(str(config["run_dir"]), str(config["run_root"])):
         wrong.append(f"run_dir={config['run_dir']} leaves run_root={config['run_root']}: pass a run_dir")
     if wrong:
         raise ValueError("\n".join(wrong))
+
+
+def _step_size_beyond(actor: float, schedule: Mapping[str, Any]) -> Iterator[str]:
+    """Say if the first update would replace the actor's step size, because the schedule does not allow it."""
+    low, high = schedule.get("min_lr", 0.0), schedule.get("max_lr", math.inf)
+    if not low <= actor <= high:
+        yield (
+            f"step_size.actor={actor:g} is beyond what the schedule allows, {low:g} (optimizer.schedule.min_lr) to "
+            f"{high:g} (step_size.max): change one"
+        )
 
 
 def _rule(path: str) -> Rule | None:

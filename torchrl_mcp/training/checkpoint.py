@@ -5,6 +5,7 @@ manifest that holds the run's configuration and the library versions. Every part
 component, so that transfer can load only the parts that it keeps.
 """
 
+import errno
 import zlib
 from collections.abc import Collection, Mapping
 from logging import ERROR
@@ -36,6 +37,9 @@ UNREADABLE = (
     ValueError,
     zlib.error,
 )
+
+PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM)
+"""Numbers of errors of the system that say nothing about a file."""
 
 
 class RunRandomness(GlobalRNGState):
@@ -74,6 +78,7 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
 
     Raises:
         ValueError: If the file is missing, truncated, damaged, of another kind, or does not fit.
+        OSError: If the system fails, which says nothing about the file.
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint file {path}")
@@ -83,6 +88,7 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
         _require_plain_data(path)
         report = checkpoint.load(path, components=components, map_location="cpu")
     except UNREADABLE as error:
+        _raise_passing(error)
         raise ValueError(
             f"cannot restore {path}: {error}. The file is damaged or belongs to a different method, character, task or "
             "network size; give a checkpoint of the same configuration"
@@ -152,13 +158,24 @@ def find(path: Path) -> Path:
 
 
 def is_intact(path: Path) -> bool:
-    """Return whether the file ``path`` is a complete checkpoint, with a manifest and correct checksums."""
+    """Return whether the file ``path`` is a complete checkpoint, with a manifest and correct checksums.
+
+    Raises:
+        OSError: If the system fails, which says nothing about the file.
+    """
     try:
         _manifest(path)
         with ZipFile(path) as archive:
             return archive.testzip() is None
-    except UNREADABLE:
+    except UNREADABLE as error:
+        _raise_passing(error)
         return False
+
+
+def _raise_passing(error: BaseException) -> None:
+    """Raise an error that says nothing about a file, instead of judging the file by it."""
+    if isinstance(error, OSError) and error.errno in PASSING:
+        raise error
 
 
 def set_aside(path: Path) -> None:
@@ -192,6 +209,7 @@ def _manifest(path: Path) -> Mapping[str, Any]:
         if "config" in manifest["metadata"]:
             return manifest
     except UNREADABLE as error:
+        _raise_passing(error)
         raise ValueError(f"{path} is damaged, or is not a checkpoint of torchrl-mcp: {error}") from error
     raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: it holds no configuration")
 

@@ -234,7 +234,7 @@ class RemoteSource:
             return attend(self._next, self._workers).reshape(self.num_envs, self._steps).to(self._device)
 
     def metrics(self) -> dict[str, float]:
-        """Return no metrics: the environments are in the workers."""
+        """Return no metrics, not even ``episode/diverged``: the environments are in the workers."""
         return {}
 
     def stop(self) -> None:

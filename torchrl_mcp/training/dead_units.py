@@ -1,4 +1,4 @@
-"""Dead units: hidden units that no input activates any more, so that no gradient reaches them."""
+"""Dead units: hidden units that no sample of a batch activates, so that the batch changes nothing about them."""
 
 from collections.abc import Callable
 from contextlib import ExitStack

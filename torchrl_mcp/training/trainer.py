@@ -208,7 +208,7 @@ class Trainer:
             self.schedule.step(metrics["loss/kl"])
         if "actor" in self.optimizers:
             metrics["loss/actor_step_size"] = self.optimizers["actor"].param_groups[0]["lr"]
-        return metrics | self._network_metrics(samples[: self.minibatch_size])
+        return metrics | self._network_metrics(samples)
 
     def _network_metrics(self, samples: TensorDictBase) -> dict[str, float]:
         """Return metrics of exploration and of dead units, from samples ``(B,)``."""
