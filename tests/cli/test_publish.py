@@ -173,6 +173,14 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
     assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
 
 
+@pytest.mark.parametrize("taken", ["notes.md", "notes.torchrl"])
+def test_no_file_is_overwritten(run, taken, tmp_path):
+    (tmp_path / taken).write_text("mine")
+    with pytest.raises(ValueError, match=f"{taken} is there already: remove it, or pass another --output"):
+        publishing.publish(run, tmp_path / "notes.torchrl", episodes=1, limits=[])
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
 def test_the_card_compares_no_range_of_speeds_with_the_paper(tmp_path):
     values = {"normalised_return": 0.5, "interval": (0.4, 0.6), "terminated": 0.0, "metrics": {}}
     numbers = {"episodes": 2, "seed": 0, "deterministic": values, "stochastic": values}

@@ -41,6 +41,10 @@ def test_estimates_are_the_same_again():
     assert mean(values) == mean(values)
 
 
+def test_tasks_with_more_seeds_weigh_no_more_in_the_interquartile_mean():
+    assert interquartile_mean([[1, 1, 1, 1], [3]]).value == pytest.approx(2)
+
+
 def test_the_interquartile_mean_leaves_out_the_outer_quarters_of_all_tasks_together():
     assert interquartile_mean([[0, 7, 2, 5], [1, 6, 3, 400]]).value == pytest.approx((2 + 3 + 5 + 6) / 4)
 

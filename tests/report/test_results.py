@@ -60,7 +60,11 @@ def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
 @pytest.mark.parametrize(
     ("file", "content", "reason"),
     [
-        ("metrics.csv", "iteration,frames\n1,many\n", "metrics.csv cannot be read: could not convert .*'many'"),
+        (
+            "metrics.csv",
+            "iteration,frames\n1,many\n",
+            "metrics.csv cannot be read: .*metrics.csv:2 is damaged: could not convert .*'many'",
+        ),
         ("metrics.csv", "iteration,frames\n1,100\n", "metrics.csv cannot be read: it lacks 'seconds'"),
         ("metrics.csv", b"\xff\xfe\xff", "metrics.csv cannot be read: .*decode"),
         ("evaluation.json", '{"episodes": 1', "evaluation.json cannot be read: Expecting"),

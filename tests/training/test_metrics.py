@@ -5,6 +5,7 @@ import pytest
 from torchrl.record.loggers import get_logger
 
 from torchrl_mcp.training.metrics import MetricsWriter
+from torchrl_mcp.training.run_folder import read_metrics
 
 
 class Recorder:
@@ -156,3 +157,12 @@ def test_the_csv_logger_holds_every_step_once_after_a_rewind(tmp_path):
         second.write({"iteration": i, "frames": 100 * i, "task/loss": i / 2}, step=100 * i)
     lines = (tmp_path / "csv/scalars/task/loss.csv").read_text().split()
     assert lines == ["100,0.5", "200,1.0", "300,1.5", "400,2.0", "500,2.5"]
+
+
+def test_a_row_with_a_number_too_many_or_none_is_dropped_where_a_run_goes_on_and_named_where_it_is_read(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("iteration,frames,loss\n1,10,0,5\n2,20,0.5\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv:2 is damaged"):
+        read_metrics(tmp_path)
+    MetricsWriter(tmp_path).rewind(2)
+    assert table(tmp_path) == [{"iteration": "2", "frames": "20", "loss": "0.5"}]

@@ -28,13 +28,16 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
         limits: Sentences about the policy's limits.
 
     Raises:
-        ValueError: If the folder holds no run, or its policy cannot be published.
+        ValueError: If the folder holds no run, its policy cannot be published, or a file would be overwritten.
     """
+    card = output.with_suffix(".md")
+    for path in (output, card):
+        if path.exists():
+            raise ValueError(f"{path} is there already: remove it, or pass another --output")
     cfg = records.run_config(run)
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
-    card = output.with_suffix(".md")
     card.write_text(
         model_card(output, cfg, numbers, origin, steps=run_folder.frames(checkpoint.find(run)), limits=limits)
     )

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -47,6 +46,8 @@ def deviation(values: Sequence[float]) -> float:
 def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
     """Return the mean of the middle half of all values, with a bootstrap interval that resamples within each stratum.
 
+    Strata of unequal size weigh the same.
+
     Args:
         strata: Values by task, one per seed.
 
@@ -59,7 +60,12 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
     """
     from scipy.stats import trim_mean  # slow to import
 
-    return _estimate(strata, _pooled(partial(trim_mean, proportiontocut=0.25)))
+    def middle(*samples: np.ndarray, axis: int) -> np.ndarray:
+        size = math.lcm(*(sample.shape[axis] for sample in samples))
+        equal = [np.repeat(sample, size // sample.shape[axis], axis=axis) for sample in samples]
+        return np.asarray(trim_mean(np.concatenate(equal, axis=axis), 0.25, axis=axis))
+
+    return _estimate(strata, middle)
 
 
 def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Estimate:

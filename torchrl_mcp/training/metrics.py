@@ -104,4 +104,5 @@ class MetricsWriter:
             return []
         with self.path.open(newline="", errors="replace") as file:
             rows = csv.DictReader(line.replace("\0", "") for line in file)
-            return [row for row in rows if None not in {*row, *row.values()} and row.get("iteration", "").isdecimal()]
+            whole = (row for row in rows if None not in row and None not in row.values())
+            return [row for row in whole if row.get("iteration", "").isdecimal()]

@@ -92,13 +92,20 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete last row is left out."""
+    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete last row is left out.
+
+    Raises:
+        ValueError: If a row is damaged.
+    """
     path = run / METRICS
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        whole = (line for line in file if line.endswith("\n"))
-        return [{name: float(value or "nan") for name, value in row.items()} for row in csv.DictReader(whole)]
+        rows = csv.DictReader(line for line in file if line.endswith("\n"))
+        try:
+            return [{name: float(value or "nan") for name, value in row.items()} for row in rows]
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}:{rows.line_num} is damaged: {error}; correct or remove the line") from error
 
 
 def find_all(run: Path) -> list[Path]:
