@@ -120,3 +120,11 @@ def test_watching_needs_a_run_folder_and_a_viewer(monkeypatch, capsys, words):
     with pytest.raises(SystemExit):
         call(monkeypatch, "--watch", *words)
     assert "--watch takes a run folder, and --viewer web or --viewer window" in capsys.readouterr().err
+
+
+def test_a_folder_of_settings_that_is_not_there_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        "sys.argv", ["play", "--agent", "zero", "--config-dir", str(tmp_path / "nowhere"), "task=heading"]
+    )
+    with pytest.raises(SystemExit, match=r"there is no folder .*nowhere: correct --config-dir"):
+        play.main()

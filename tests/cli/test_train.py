@@ -127,6 +127,10 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
     ("arguments", "answer"),
     [
         (["method=mpc"], "there is no method=mpc: did you mean mcp? The choices are finetune, hierarchical, "),
+        (["mcp"], "mcp is no setting: write NAME=VALUE without spaces"),
+        (["method", "=", "mcp"], "method = mcp is no setting: write NAME=VALUE without spaces"),
+        (["--config-dir", "nowhere", "method=mcp"], "nowhere"),
+        (["--config-dir", "nowhere", "benchmark=smoke"], "there is no folder nowhere: correct --config-dir"),
         (["seed=1,2,3"], "seed=1,2,3 has several values: add --multirun"),
         (["seed=range(0,3)"], "seed=range(0,3) has several values: add --multirun"),
         (["hydra/launcher=ray"], "pip install 'torchrl-mcp[ray-launcher]'"),

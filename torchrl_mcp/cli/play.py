@@ -28,6 +28,8 @@ def main() -> None:
     try:
         if arguments.agent is None:
             locate(arguments.checkpoint)
+        elif arguments.config_dir and not arguments.config_dir.is_dir():
+            raise ValueError(f"there is no folder {arguments.config_dir}: correct --config-dir")
         elif arguments.config_dir:
             find_own_modules()
         if arguments.viewer is None:

@@ -3,6 +3,7 @@
 import difflib
 import shlex
 from collections.abc import Sequence
+from itertools import pairwise
 
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -23,11 +24,19 @@ def answer(error: HydraException, words: Sequence[str], *, multirun: bool) -> st
         words: The command line.
         multirun: Whether settings may have several values.
     """
-    settings = [word for word in words if not word.startswith("-")]
-    lines = unreadable(settings) or ([] if multirun else swept(settings)) or suggestions(settings)
+    settings = [word for word in words if ("=" in word or word.startswith("~")) and not word.startswith("-")]
+    lines = stray(words) or unreadable(settings) or ([] if multirun else swept(settings)) or suggestions(settings)
     if not lines and isinstance(error, MissingConfigException):
         lines = [_missing(error)]
     return "\n".join(lines) or "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def stray(words: Sequence[str]) -> list[str]:
+    """Return a line if words are no setting, no deletion of one and no option or its value."""
+    values = {follower for word, follower in pairwise(words) if word.startswith("-") and "=" not in word}
+    strays = [word for word in words if "=" not in word or word == "="]
+    strays = [word for word in strays if not word.startswith(("-", "~")) and word not in values]
+    return [f"{' '.join(strays)} is no setting: write NAME=VALUE without spaces, such as method=mcp"] if strays else []
 
 
 def unreadable(settings: Sequence[str]) -> list[str]:

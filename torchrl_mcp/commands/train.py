@@ -104,6 +104,8 @@ def run_benchmark(arguments: list[str]) -> None:
     options, settings = parser.parse_known_args(arguments)
     if unknown := [setting for setting in settings if setting.startswith("-")]:
         sys.exit(f"{PROGRAM}: a benchmark takes settings and --config-dir, but not {' '.join(unknown)}")
+    if options.config_dir and not options.config_dir.is_dir():
+        sys.exit(f"{PROGRAM}: there is no folder {options.config_dir}: correct --config-dir")
     if options.config_dir:
         settings.append(f"hydra.searchpath=[{quoting.quoted(f'file://{options.config_dir.resolve()}')}]")
     announce(PROGRAM)
