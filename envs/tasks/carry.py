@@ -85,17 +85,9 @@ class Carry(Transport):
             lo is raised until the tables are apart.
         target_directions: Range (lo, hi) of the direction from the box to the target, in radians from the direction of
             the box: 0 is straight beyond the box.
-        speed: Target speed of character and box, in m/s. Paper: 1.
-        target_distance_power: Power of the distance between box and target in the reward: 2 (paper) or 1.
-        success_reward: Set the reward to 1 while successful.
-        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
-            :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A table is 0.3 m wide, and in standardised metres
-            this is less than a tenth.
-        waypoint: End the goal with the place where the character should go next,
-            :func:`~torchrl_mcp.envs.tasks.waypoints.carry_waypoint`, as :class:`.Location` shows places.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code for a ball.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.tasks.transport_env.Transport`.
 
     Raises:
         ValueError: If an argument is out of range, or the character has no carrier.
@@ -123,22 +115,12 @@ class Carry(Transport):
         object_directions: Sequence[float] = ANY_DIRECTION,
         target_distances: Sequence[float] = (0.0, 10.0),
         target_directions: Sequence[float] = ANY_DIRECTION,
-        speed: float = 1.0,
-        target_distance_power: float = 2,
-        success_reward: bool = False,
-        goal_positions: str = "metres",
-        waypoint: bool = False,
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
         super().__init__(
             character,
             num_envs,
-            speed=speed,
-            target_distance_power=target_distance_power,
-            success_reward=success_reward,
-            goal_positions=goal_positions,
-            waypoint=waypoint,
             furnish=self._furnish,
             model_fields=["eq_data"],
             max_episode_steps=max_episode_steps,

@@ -76,16 +76,9 @@ class Dribble(Transport):
         target_distances: Range (lo, hi) of the target's distance from the ball, in metres.
         target_directions: Range (lo, hi) of the direction from the ball to the target, in radians from the direction of
             the ball: 0 is straight beyond the ball.
-        speed: Target speed of character and ball, in m/s. Paper: 1.
-        target_distance_power: Power of the distance between ball and target in the reward: 2 (paper) or 1.
-        success_reward: Set the reward to 1 while successful.
-        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
-            :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`.
-        waypoint: End the goal with the place where the character should go next,
-            :func:`~torchrl_mcp.envs.tasks.waypoints.dribble_waypoint`, as :class:`.Location` shows places.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
             3000 are 100 s, as in the same authors' public code.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.tasks.transport_env.Transport`.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -113,22 +106,12 @@ class Dribble(Transport):
         object_directions: Sequence[float] = ANY_DIRECTION,
         target_distances: Sequence[float] = (0.0, 10.0),
         target_directions: Sequence[float] = ANY_DIRECTION,
-        speed: float = 1.0,
-        target_distance_power: float = 2,
-        success_reward: bool = False,
-        goal_positions: str = "metres",
-        waypoint: bool = False,
         max_episode_steps: int = 3000,
         **kwargs: Any,
     ) -> None:
         super().__init__(
             character,
             num_envs,
-            speed=speed,
-            target_distance_power=target_distance_power,
-            success_reward=success_reward,
-            goal_positions=goal_positions,
-            waypoint=waypoint,
             furnish=add_pitch,
             max_episode_steps=max_episode_steps,
             **kwargs,

@@ -24,11 +24,14 @@ class Transport(PDCharacterEnv):
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
-        speed: See :class:`.Carry` for this and the next four.
-        target_distance_power: 2 or 1.
+        speed: Target speed of character and object, in m/s. Paper: 1.
+        target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
         success_reward: Set the reward to 1 while successful.
-        goal_positions: ``"metres"`` or ``"logarithmic"``.
-        waypoint: End the goal with the place where the character should go next.
+        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
+            :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A table is 0.3 m wide, and in standardised metres
+            this is less than a tenth.
+        waypoint: End the goal with the place where the character should go next, see
+            :mod:`~torchrl_mcp.envs.tasks.waypoints`, as :class:`.Location` shows places.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
     Raises:
@@ -54,11 +57,11 @@ class Transport(PDCharacterEnv):
         character: str,
         num_envs: int,
         *,
-        speed: float,
-        target_distance_power: float,
-        success_reward: bool,
-        goal_positions: str,
-        waypoint: bool,
+        speed: float = 1.0,
+        target_distance_power: float = 2,
+        success_reward: bool = False,
+        goal_positions: str = "metres",
+        waypoint: bool = False,
         **kwargs: Any,
     ) -> None:
         require_transport(speed=speed, target_distance_power=target_distance_power, goal_positions=goal_positions)

@@ -13,8 +13,7 @@ from torchrl_mcp.envs.motions.capture.joint_motion import (
     NO_ROTATION,
     TOP_SPEED,
     JointMotion,
-    closed_numbers,
-    closed_turns,
+    closed_values,
     speeds,
 )
 from torchrl_mcp.envs.motions.capture.skeleton import frame_rate
@@ -61,11 +60,8 @@ def read_deepmimic(path: str | Path, *, fps: float | None = None, quaternion: st
     times = _times(file, frames[:, 0] if fps is None else torch.full_like(frames[:, 0], 1 / frame_rate(fps, 1.0)))
     _require_no_jump(file, root, times)
     if loop:
-        root[:, 2] = closed_numbers(root[:, 2])
-        motion = {
-            joint: closed_numbers(values) if values.ndim == 1 else closed_turns(values)
-            for joint, values in motion.items()
-        }
+        root[:, 2] = closed_values(root[:, 2])
+        motion = {joint: closed_values(values) for joint, values in motion.items()}
     return JointMotion(root, motion, times, loop)
 
 

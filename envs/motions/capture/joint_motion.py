@@ -93,27 +93,20 @@ def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[Moti
 def closed(motion: JointMotion) -> JointMotion:
     """Make a motion a cycle: heights, tilts of the root and joints end as they began; path and heading are kept."""
     path, root = motion.path.clone(), motion.joints["root"]
-    path[:, 2] = closed_numbers(path[:, 2])
+    path[:, 2] = closed_values(path[:, 2])
     headings = about_z(heading(root))
-    joints = {
-        name: closed_numbers(values) if values.ndim == 1 else closed_turns(values)
-        for name, values in motion.joints.items()
-        if name != "root"
-    }
-    joints["root"] = multiply(headings, closed_turns(multiply(inverse(headings), root)))
+    joints = {name: closed_values(values) for name, values in motion.joints.items() if name != "root"}
+    joints["root"] = multiply(headings, closed_values(multiply(inverse(headings), root)))
     return motion._replace(path=path, joints=joints, loop=True)
 
 
-def closed_numbers(values: Tensor) -> Tensor:
-    """Close a cycle of numbers, shape ``(T,)``, by spreading the difference of its ends evenly over time."""
-    return values + (values[0] - values[-1]) * torch.linspace(0, 1, len(values), dtype=torch.float64)
-
-
-def closed_turns(turns: Tensor) -> Tensor:
-    """Close a cycle of rotations, shape ``(T, 4)``, in the same way."""
-    missing = to_rotation_vector(multiply(inverse(turns[-1]), turns[0]))
-    fraction = torch.linspace(0, 1, len(turns), dtype=torch.float64)
-    return multiply(turns, from_rotation_vector(fraction.unsqueeze(-1) * missing))
+def closed_values(values: Tensor) -> Tensor:
+    """Close a cycle of numbers, ``(T,)``, or rotations, ``(T, 4)``, by spreading what is missing evenly over time."""
+    fraction = torch.linspace(0, 1, len(values), dtype=torch.float64)
+    if values.ndim == 1:
+        return values + (values[0] - values[-1]) * fraction
+    missing = to_rotation_vector(multiply(inverse(values[-1]), values[0]))
+    return multiply(values, from_rotation_vector(fraction.unsqueeze(-1) * missing))
 
 
 def states(character: str, motion: JointMotion) -> tuple[Tensor, Tensor]:
