@@ -17,7 +17,7 @@ from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic
 from torchrl_mcp.methods.options import SeparateOptions, Terminations
 from torchrl_mcp.methods.transforms import OptionMemory
 from torchrl_mcp.modules import GaussianPolicy, JointGating, Primitives
-from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss, SemiMarkovAdvantages
+from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss, OptionValueLoss, SemiMarkovAdvantages
 
 
 class FourCorners(EnvBase):
@@ -75,7 +75,7 @@ def test_the_option_critic_learns_options_that_beat_chance():
     )
     actor, critic = option_critic_actor(parts, num_options=4, epsilon=0.1), option_values(parts, Sizes(2, 4, 2))
     advantages = OptionAdvantages(critic, gamma=0.95, lmbda=0.95, clip=4.0, epsilon=0.1, termination_cost=0.01)
-    loss = OptionCriticLoss(actor.trained, critic, clip_epsilon=0.2, bound_coeff=0.0)
+    losses = OptionCriticLoss(actor.trained, clip_epsilon=0.2, bound_coeff=0.0), OptionValueLoss(critic, coeff=0.5)
     optimizer = torch.optim.Adam(
         [{"params": actor.trained.parameters(), "lr": 3e-3}, {"params": parts["critic"].parameters(), "lr": 2e-2}]
     )
@@ -88,8 +88,8 @@ def test_the_option_critic_learns_options_that_beat_chance():
     for _ in range(25):
         samples = advantages(play()).flatten()
         for index in torch.cat([torch.randperm(len(samples)) for _ in range(2)]).split(1024):
-            report = loss(samples[index])
-            sum(value for key, value in report.items() if key.startswith("loss_")).backward()
+            terms = [term for loss in losses for key, term in loss(samples[index]).items() if key.startswith("loss_")]
+            sum(terms).backward()
             optimizer.step()
             optimizer.zero_grad()
     with set_exploration_type(ExplorationType.DETERMINISTIC):

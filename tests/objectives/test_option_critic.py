@@ -5,11 +5,16 @@ from statistics import mean, stdev
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
 from torch.distributions import Categorical
 
-from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss
+from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss, OptionValueLoss
 
 GAMMA, STATES, OPTIONS, ACTIONS = 0.9, 4, 2, 3
 
@@ -50,18 +55,14 @@ class Problem:
         return (self.resolvent(pi, beta) @ rewards.flatten()).view(STATES, OPTIONS)
 
 
-def tabular_loss(options, values=None, **kwargs):
+def tabular_loss(options, **kwargs):
     actor = ProbabilisticTensorDictSequential(
         TensorDictModule(
             options, in_keys=["observation", "option", ("next", "observation")], out_keys=["logits", "termination"]
         ),
         ProbabilisticTensorDictModule(["logits"], ["action"], distribution_class=Categorical, return_log_prob=True),
     )
-    table = nn.Embedding(STATES, OPTIONS, dtype=torch.float64)
-    if values is not None:
-        table.weight.data.copy_(values)
-    critic = TensorDictModule(table, in_keys=["observation"], out_keys=["option_values"])
-    return OptionCriticLoss(actor, critic, **{"clip_epsilon": 0.2, "bound_coeff": 0.0, **kwargs})
+    return OptionCriticLoss(actor, **{"clip_epsilon": 0.2, "bound_coeff": 0.0, **kwargs})
 
 
 def every_step():
@@ -109,15 +110,12 @@ def test_its_gradients_are_those_of_the_exact_value(start):
 
 def test_values_regress_to_their_targets_where_the_option_acted():
     problem, options = Problem(), Options()
-    samples = exact_samples(problem, options, 0)
-    loss = tabular_loss(options)
-    error = loss.critic_network.module.weight.detach() - problem.values(
-        options.policies.softmax(-1), options.terminations.sigmoid()
-    )
-    loss(samples)["loss_critic"].backward()
+    table = nn.Embedding(STATES, OPTIONS, dtype=torch.float64)
+    critic = TensorDictSequential(TensorDictModule(table, in_keys=["observation"], out_keys=["option_values"]))
+    values = problem.values(options.policies.softmax(-1), options.terminations.sigmoid())
+    OptionValueLoss(critic, coeff=0.5)(exact_samples(problem, options, 0))["loss_critic"].backward()
     # Each of the S K entries has the same share of the samples.
-    expected = (error / (STATES * OPTIONS)).detach()
-    torch.testing.assert_close(loss.critic_network.module.weight.grad, expected)
+    torch.testing.assert_close(table.weight.grad, ((table.weight - values) / (STATES * OPTIONS)).detach())
 
 
 def test_the_ratio_is_clipped_when_samples_are_used_again():
@@ -133,11 +131,11 @@ def test_the_ratio_is_clipped_when_samples_are_used_again():
     assert not options.policies.grad.any()
 
 
-def test_frozen_options_leave_the_values_alone_to_learn():
+def test_frozen_options_leave_no_term():
     options = Options().requires_grad_(False)
     loss = tabular_loss(options)
     report = loss(exact_samples(Problem(), options, 0).select(*loss.in_keys).exclude("next"))
-    assert list(report.keys()) == loss.out_keys == ["loss_critic"]
+    assert list(report.keys()) == loss.out_keys == []
 
 
 def test_frozen_terminations_leave_the_options_to_learn():
@@ -148,19 +146,9 @@ def test_frozen_terminations_leave_the_options_to_learn():
     )
     actor = ProbabilisticTensorDictSequential(acting, whole.actor_network[-1])
     actor.policies = options.policies
-    loss = OptionCriticLoss(actor, whole.critic_network, clip_epsilon=0.2, bound_coeff=0.0)
+    loss = OptionCriticLoss(actor, clip_epsilon=0.2, bound_coeff=0.0)
     report, expected = loss(samples), whole(samples)
     assert list(report.keys()) == loss.out_keys == [key for key in whole.out_keys if key != "loss_termination"]
-    for key, value in report.items():
-        assert torch.equal(value, expected[key]), key
-
-
-def test_without_a_critic_the_terms_of_the_options_are_left():
-    options = Options()
-    samples, whole = exact_samples(Problem(), options, 0), tabular_loss(options)
-    loss = OptionCriticLoss(whole.actor_network, None, clip_epsilon=0.2, bound_coeff=0.0)
-    report, expected = loss(samples), whole(samples)
-    assert list(report.keys()) == loss.out_keys == [key for key in whole.out_keys if key != "loss_critic"]
     for key, value in report.items():
         assert torch.equal(value, expected[key]), key
 

@@ -133,8 +133,24 @@ def test_a_run_of_a_gpu_goes_on_without_one_if_told_to(run, tmp_path):
 def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
     outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
     assert outcome.returncode != 0
-    assert "different method, character, task or network size" in outcome.stderr
+    assert "has networks of num_primitives=8, which do not fit num_primitives=4: change either" in outcome.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_transfer_from_another_character_and_method_names_both(command, tmp_path):
+    arguments = ["task=heading", "character=humanoid", "method=moe", "stage=transfer", "pretrained=builtin:biped"]
+    outcome = command("train", *FAST, *arguments, cwd=tmp_path)
+    assert outcome.returncode != 0
+    difference = "networks of method=mcp character=biped, which do not fit method=moe character=humanoid: change either"
+    assert difference in outcome.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ["0", "-3", "1.5"])
+def test_a_wrong_number_of_episodes_is_named(command, tmp_path, number):
+    outcome = command("evaluate", "builtin:biped", "--episodes", number, cwd=tmp_path)
+    assert outcome.returncode != 0
+    assert f"argument --episodes: '{number}' is no whole number of at least 1" in outcome.stderr
 
 
 def flip_a_byte(data):

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, interruptible, new_parser, settings
+from torchrl_mcp.cli.parsing import add_task, add_trust, count, interruptible, new_parser, settings
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
@@ -75,11 +75,14 @@ def parser() -> argparse.ArgumentParser:
         "checkpoint",
         help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
     )
-    for name, meaning in (("episodes", "episodes, one per environment"), ("seed", "seed of environments and sampling")):
-        default = settings("train")["evaluation"][name]
-        parser.add_argument(f"--{name}", type=int, default=default, help=f"{meaning} (default %(default)s)")
+    defaults = settings("train")["evaluation"]
+    for name, kind, meaning in (
+        ("episodes", count, "episodes, one per environment"),
+        ("seed", int, "seed of environments and sampling"),
+    ):
+        parser.add_argument(f"--{name}", type=kind, default=defaults[name], help=f"{meaning} (default %(default)s)")
     parser.add_argument(
-        "--clips", type=int, metavar="N", help="imitation only: follow each reference motion alone, in N episodes"
+        "--clips", type=count, metavar="N", help="imitation only: follow each reference motion alone, in N episodes"
     )
     add_task(parser)
     add_trust(parser)

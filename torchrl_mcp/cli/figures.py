@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, count, interruptible, new_parser
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
@@ -56,12 +56,12 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("holdout", parents=[shared], help="Figure 5: curves and trajectories of the ant")
     command.set_defaults(draw="holdout")
     command = commands.add_parser("exploration", parents=[shared], help="Figure 6: paths of random exploration")
-    command.add_argument("--trajectories", type=int, default=48, metavar="N", help="how many (default %(default)s)")
+    command.add_argument("--trajectories", type=count, default=48, metavar="N", help="how many (default %(default)s)")
     command.add_argument("--seconds", type=float, default=10.0, help="length of each (default %(default)s)")
     command.set_defaults(draw="explore")
     command = commands.add_parser("primitives", parents=[shared], help="Figure 7: weights over the walk cycle, actions")
     command.add_argument("--clip", help="generated motion to follow, such as left_sharp (default straight ahead)")
-    command.add_argument("--walkers", type=int, default=8, metavar="N", help="how many (default %(default)s)")
+    command.add_argument("--walkers", type=count, default=8, metavar="N", help="how many (default %(default)s)")
     command.add_argument("--seconds", type=float, default=10.0, help="length of each walk (default %(default)s)")
     command.set_defaults(draw="analyse")
     return parser

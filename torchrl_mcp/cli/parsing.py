@@ -54,6 +54,13 @@ def own_module(name: str) -> str:
     return name
 
 
+def count(text: str) -> int:
+    """Return a number of at least 1."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 1")
+    return int(text)
+
+
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--trust``."""
     parser.add_argument(

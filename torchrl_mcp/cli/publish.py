@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser, settings
+from torchrl_mcp.cli.parsing import add_trust, count, interruptible, new_parser, settings
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-publish"
@@ -47,7 +47,9 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--limits", action="append", default=[], help="a sentence of the card's limits; repeatable")
     episodes = settings("train")["evaluation"]["episodes"]
-    parser.add_argument("--episodes", type=int, default=episodes, help="of the card's evaluation (default %(default)s)")
+    parser.add_argument(
+        "--episodes", type=count, default=episodes, help="of the card's evaluation (default %(default)s)"
+    )
     return parser
 
 

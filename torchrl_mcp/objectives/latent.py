@@ -35,7 +35,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase | None,
+        critic_network: TensorDictModuleBase | None = None,
         *,
         kl_coeff: float,
         **kwargs: Any,

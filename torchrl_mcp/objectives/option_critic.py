@@ -97,11 +97,12 @@ class OptionAdvantages:
 
 
 class OptionValueLoss(ValueLoss):
-    r"""Mean squared error of the values of the options that acted, the third term of :class:`OptionCriticLoss`.
+    r"""Mean squared error of the values of the options that acted.
 
     .. math:: L = c \, \mathbb{E} (Q_\Omega(s, \omega) - y)^2
 
-    Of the critic it evaluates what the values need: terminations are the actor's, which may learn at the same time.
+    With :math:`c = 1/2` its gradient is that of intra-option Q-learning. Of the critic it evaluates what the values
+    need: terminations are the actor's, which may learn at the same time.
 
     Args:
         critic_network: Sequence from ``observation`` and ``goal`` to ``option_values``, ``(B, K)``, and other keys.
@@ -117,25 +118,22 @@ class OptionValueLoss(ValueLoss):
 
 
 class OptionCriticLoss(LossModule):
-    r"""The updates of the option-critic, as one loss.
+    r"""The updates of the options and their terminations, as one loss; :class:`OptionValueLoss` is that of the values.
 
     .. math::
         L = -\mathbb{E} \min(\rho A, \operatorname{clip}(\rho, 1 - \epsilon, 1 + \epsilon) A)
         + \mathbb{E} \, \beta_\omega(s') (A_\Omega(s', \omega) + \xi)
-        + \tfrac{1}{2} \mathbb{E} (Q_\Omega(s, \omega) - y)^2
         + c \, \mathbb{E} \sum_j \max(0, |\mu_j| - b)^2
 
     with :math:`\rho = \pi_\omega(a|s) / \pi_\omega^{\mathrm{old}}(a|s)`. Samples that are used once have
-    :math:`\rho = 1`, and the gradients of the first three terms are those of the intra-option policy gradient theorem,
-    of the termination gradient theorem and of intra-option Q-learning; the clipped ratio lets samples be used several
-    times. If the options and terminations are frozen, only the third term remains; if the terminations alone are,
-    ``actor_network`` leaves ``termination`` out, and so does the loss.
+    :math:`\rho = 1`, and the gradients of the first two terms are those of the intra-option policy gradient theorem and
+    of the termination gradient theorem; the clipped ratio lets samples be used several times. If the options and
+    terminations are frozen, no term remains; if the terminations alone are, ``actor_network`` leaves ``termination``
+    out, and so does the loss.
 
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
             :math:`\beta_\omega(s')`.
-        critic_network: From ``observation`` and ``goal`` to ``option_values``; None leaves the third term to
-            :class:`OptionValueLoss`.
         clip_epsilon: :math:`\epsilon`.
         bound_coeff: Weight of the penalty on means out of bounds, :math:`c`; 0 for distributions without a mean.
         bound: Largest absolute mean action, :math:`b`.
@@ -152,11 +150,9 @@ class OptionCriticLoss(LossModule):
         action: NestedKey = "action"
         sample_log_prob: NestedKey = "action_log_prob"
         option: NestedKey = "option"
-        option_values: NestedKey = "option_values"
         termination: NestedKey = "termination"
         advantage: NestedKey = "advantage"
         termination_advantage: NestedKey = "termination_advantage"
-        value_target: NestedKey = "value_target"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -164,14 +160,13 @@ class OptionCriticLoss(LossModule):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase | None,
         *,
         clip_epsilon: float,
         bound_coeff: float,
         bound: float = 1.0,
     ) -> None:
         super().__init__()
-        self.actor_network, self.critic_network = actor_network, critic_network
+        self.actor_network = actor_network
         self.clip_epsilon, self.bound_coeff, self.bound = clip_epsilon, bound_coeff, bound
 
     @property
@@ -183,37 +178,24 @@ class OptionCriticLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Keys of a sample that the loss reads."""
         keys = self.tensor_keys
-        estimates = [keys.sample_log_prob, keys.option, keys.advantage, keys.termination_advantage, keys.value_target]
-        critic = [] if self.critic_network is None else self.critic_network.in_keys
-        return list(dict.fromkeys([keys.action, *self.actor_network.in_keys, *critic, *estimates]))
+        estimates = [keys.sample_log_prob, keys.option, keys.advantage, keys.termination_advantage]
+        return list(dict.fromkeys([keys.action, *self.actor_network.in_keys, *estimates]))
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of the terms that the loss returns."""
-        critic = [] if self.critic_network is None else ["loss_critic"]
         if not self._learns_options():
-            return critic
+            return []
         terminations = ["loss_termination"] if self._learns_terminations() else []
-        losses = [*critic, "loss_objective", *terminations, "loss_bound"]
-        return [*losses, "kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
+        statistics = ["kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
+        return ["loss_objective", *terminations, "loss_bound", *statistics]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the terms of the loss and statistics of the update, as scalars."""
-        terms = self._critic_losses(tensordict)
-        if self._learns_options():
-            terms |= self._option_losses(tensordict)
-        return TensorDict(terms)
+        return TensorDict(self._losses(tensordict) if self._learns_options() else {})
 
-    def _critic_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        if self.critic_network is None:
-            return {}
-        keys = self.tensor_keys
-        values = self.critic_network(tensordict.select(*self.critic_network.in_keys))[keys.option_values]
-        error = of_option(values, tensordict[keys.option]) - tensordict[keys.value_target]
-        return {"loss_critic": error.square().mean() / 2}
-
-    def _option_losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+    def _losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         keys = self.tensor_keys
         outputs = self.actor_network.get_dist_params(tensordict.select(*self.actor_network.in_keys))
         distribution = self.actor_network.build_dist_from_params(outputs)

@@ -31,7 +31,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase | None,
+        critic_network: TensorDictModuleBase | None = None,
         *,
         bound_coeff: float,
         bound: float = 1.0,

@@ -1,7 +1,8 @@
 """Builds environments, agent and trainer from a configuration, with Hydra's ``instantiate``."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.publish import load_kept
 from torchrl_mcp.runs.requirements import require_arguments, require_entry, require_environment, require_files
 from torchrl_mcp.training import checkpoint
@@ -105,7 +107,8 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     if cfg.stage.name == "transfer":
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
         if pretrained is not None and cfg.transfer.keep:
-            _load_kept(cfg, parts, sizes, env, pretrained)
+            with _origin_named(cfg, pretrained):
+                _load_kept(cfg, parts, sizes, env, pretrained)
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze
@@ -114,9 +117,27 @@ def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = Non
     actor = instantiate(cfg.actor)(parts, frozen=names)
     critic = instantiate(cfg.critic)(parts, sizes)
     if cfg.stage.name == "pretrain" and pretrained is not None:
-        checkpoint.load_agent(parts, pretrained)
+        with _origin_named(cfg, pretrained):
+            checkpoint.load_agent(parts, pretrained)
     parts.to(cfg.device)
     return Agent(parts, actor, critic, frozen)
+
+
+@contextmanager
+def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
+    """Say, if networks do not fit, in what the run that they come from differs from this one."""
+    try:
+        yield
+    except ValueError as error:
+        saved = OmegaConf.create(translated(checkpoint.saved_config(pretrained)))
+        numbers = [name for name, number in cfg.method.standard.items() if isinstance(number, int)]
+        names = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
+        theirs, ours = ({name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg))
+        if theirs == ours:
+            raise
+        other = [name for name in names if theirs[name] != ours[name]]
+        held, wanted = (" ".join(f"{name}={one[name]}" for name in other) for one in (theirs, ours))
+        raise ValueError(f"{pretrained} has networks of {held}, which do not fit {wanted}: change either") from error
 
 
 def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: CharacterEnv, pretrained: Path) -> None:
@@ -144,7 +165,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
         "critic": list(agent.parts["critic"].parameters()),
     }
     optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
-    loss = instantiate(cfg.objective.loss)(agent.actor.trained, None)
+    loss = instantiate(cfg.objective.loss)(agent.actor.trained)
     loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
     advantages = instantiate(cfg.objective.advantages)(agent.critic)
     if symmetry := instantiate(cfg.get("symmetry")):

@@ -210,7 +210,10 @@ def _manifest(path: Path) -> Mapping[str, Any]:
             return manifest
     except UNREADABLE as error:
         _raise_passing(error)
-        raise ValueError(f"{path} is damaged, or is not a checkpoint of torchrl-mcp: {error}") from error
+        raise ValueError(
+            f"{path} is damaged, or is not a checkpoint of torchrl-mcp: {error}. Give another file, such as an older "
+            "checkpoint of the run"
+        ) from error
     raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: it holds no configuration")
 
 

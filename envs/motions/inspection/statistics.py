@@ -7,10 +7,8 @@ from torch import Tensor
 
 from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.inspection.signals import LegSignals, RootSignals, leg_signals, root_signals, unwrapped
+from torchrl_mcp.envs.motions.inspection.signals import LegSignals, RootSignals, leg_signals, root_signals
 from torchrl_mcp.envs.motions.inspection.strides import Stride, find_strides
-from torchrl_mcp.envs.motions.smoothing import smoothed
-from torchrl_mcp.envs.rotations import heading
 
 LEAST_FPS = 60.0
 """Frame rate below which a clip is resampled, to locate events within a hundredth of a second."""
@@ -122,18 +120,6 @@ def gait_statistics(clip: MotionClip) -> GaitStatistics:
     legs = {side: leg_signals(clip, states, side, root) for side in ("right", "left")}
     rows = [_measured(stride, root, legs, clip.fps) for stride in strides]
     return GaitStatistics(*torch.tensor(rows, dtype=torch.float64).unbind(-1))
-
-
-def speed_and_turn_rate(clip: MotionClip, window: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Speed in m/s along the heading, and turn rate in rad/s, of the root at every frame, each ``(T,)``.
-
-    Args:
-        clip: Any clip.
-        window: Length in seconds of the Hann window for smoothing.
-    """
-    yaw = smoothed(unwrapped(heading(clip.qpos[:, 3:7])), clip.fps, window)
-    forward = (clip.qvel[:, :2] * torch.stack([yaw.cos(), yaw.sin()], dim=-1)).sum(-1)
-    return smoothed(forward, clip.fps, window), torch.gradient(yaw, spacing=1 / clip.fps)[0]
 
 
 def _prepared(clip: MotionClip) -> MotionClip:

@@ -4,12 +4,20 @@ import pytest
 import torch
 
 from torchrl_mcp.envs.motions.gait.corpus import turning_clips, walking_corpus
-from torchrl_mcp.envs.motions.inspection.statistics import speed_and_turn_rate
+from torchrl_mcp.envs.motions.inspection.signals import smoothed, unwrapped
 from torchrl_mcp.envs.motions.library import MotionLibrary
+from torchrl_mcp.envs.rotations import heading
 
 # Of the paper's corpus: quantiles of the speed in m/s and of the absolute turn rate in rad/s.
 SPEEDS = {0.05: 0.38, 0.5: 0.92, 0.95: 1.42}
 TURN_RATES = {0.5: 0.50, 0.9: 1.32, 0.95: 1.61, 0.99: 2.92}
+
+
+def speed_and_turn_rate(clip, window):
+    """Speed in m/s along the heading, and turn rate in rad/s, smoothed over a window in seconds, each ``(T,)``."""
+    yaw = smoothed(unwrapped(heading(clip.qpos[:, 3:7])), clip.fps, window)
+    forward = (clip.qvel[:, :2] * torch.stack([yaw.cos(), yaw.sin()], dim=-1)).sum(-1)
+    return smoothed(forward, clip.fps, window), torch.gradient(yaw, spacing=1 / clip.fps)[0]
 
 
 def quantiles(values, expected):

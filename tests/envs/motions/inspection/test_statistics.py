@@ -7,7 +7,7 @@ from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.inspection.signals import unwrapped
-from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics, speed_and_turn_rate
+from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, multiply
 
 STRIDE = 1.2
@@ -99,12 +99,6 @@ def test_a_clip_without_strides_gives_none():
 def test_unwrapped_angles_go_on_beyond_a_full_turn():
     angles = torch.linspace(0, 20, 100, dtype=torch.float64)
     torch.testing.assert_close(unwrapped(torch.atan2(angles.sin(), angles.cos())), angles)
-
-
-def test_speed_and_turn_rate_of_a_circle_are_constant():
-    speed, turn_rate = speed_and_turn_rate(puppet(turn_rate=0.5), window=2 * STRIDE)
-    torch.testing.assert_close(speed[200:-200], torch.full_like(speed, 0.9)[200:-200], atol=5e-3, rtol=0)
-    torch.testing.assert_close(turn_rate[200:-200], torch.full_like(speed, 0.5)[200:-200], atol=5e-3, rtol=0)
 
 
 PUBLISHED = {
