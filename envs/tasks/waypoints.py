@@ -86,7 +86,7 @@ def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor
 
 
 def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
-    """The goal of :class:`.Location`, in the environment of any task.
+    """The goal of :class:`.Location` for a place ahead, in the environment of any task.
 
     Args:
         env: The environment.
@@ -97,7 +97,12 @@ def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) ->
         Each place relative to the centre of mass in the character's heading frame, with a logarithmic distance,
         ``(n, 2)``.
     """
-    return logarithmic(_turned((place - env.com[:, :2])[ids], -env.heading(ids)))
+    return logarithmic(way(env, place, ids))
+
+
+def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
+    """The way to a place as the arguments of :func:`place_seen`, in metres, ``(n, 2)``."""
+    return _turned((place - env.com[:, :2])[ids], -env.heading(ids))
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchrl_mcp.envs import Location
+from torchrl_mcp.envs.tasks.location import on_arc
 from torchrl_mcp.envs.tasks.rewards import location_reward
 
 
@@ -24,6 +25,10 @@ def stand(env, **places):
 
 def vector(*numbers):
     return torch.tensor(numbers, dtype=torch.float64)
+
+
+def polar(distance, degrees):
+    return distance * vector(math.cos(math.radians(degrees)), math.sin(math.radians(degrees)))
 
 
 @pytest.mark.parametrize(
@@ -81,6 +86,23 @@ def test_the_goal_is_the_place_in_the_characters_frame_with_a_logarithmic_distan
     goal = env.reset(state, set_state=True)["goal"][0]
     expected = math.log(1 + 2.0 / 0.25) * vector(math.cos(0.5), math.sin(0.5))
     torch.testing.assert_close(goal, expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("place", "seen"),
+    [
+        ((3.0, 30), (3.0, 30)),
+        ((3.0, 44), (3.0, 44)),
+        ((3.0, 46), (0.5, 45)),
+        ((8.0, -100), (0.5, -45)),
+        ((0.6, 170), (0.5, 45)),
+        ((0.4, 170), (0.4, 170)),  # a step back
+        ((0.4, -60), (0.4, -60)),
+        ((0.0, 0), (0.0, 0)),
+    ],
+)
+def test_a_place_far_aside_is_seen_a_step_ahead(place, seen):
+    torch.testing.assert_close(on_arc(polar(*place)), polar(*seen))
 
 
 def test_the_goal_ends_with_the_direction_to_face_if_there_is_one():
