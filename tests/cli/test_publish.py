@@ -1,6 +1,7 @@
 """Gates for tasks over the library's primitives: small files, exact, with a card that says where they come from."""
 
 import csv
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.envs.utils import step_mdp
 
 from torchrl_mcp.cli import evaluate, play, publish
 from torchrl_mcp.commands import publish as publishing
@@ -275,3 +277,18 @@ def test_every_gate_that_comes_with_the_library_does_its_task(gate):
         assert played(gate, num_envs=16, curriculum=None, **near)["metrics"]["success"] > (
             0.4 if "trex" in gate.stem else 0.6
         )
+
+
+@pytest.mark.parametrize("gate", [path for path in GATES if "location" in path.stem], ids=lambda path: path.stem)
+def test_characters_sent_back_turn_round_near_where_they_stand(gate):
+    behind = {"target_distances": (4.0, 4.0), "target_directions": (2.8, 3.5), "target_intervals": (20.0, 20.0)}
+    _, agent, env = policies.restore(gate, num_envs=32, seed=5, curriculum=None, terminate_on_fall=False, **behind)
+    state, start, turned = env.reset(), env.com.clone(), torch.zeros(32, dtype=torch.bool)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(180):
+            state = step_mdp(env.step(agent.actor.policy(state)))
+            place = env.episode["target"] - env.com[:, :2]
+            turned |= (torch.atan2(place[:, 1], place[:, 0]) - env.heading()).cos() > math.cos(math.radians(45))
+            assert not env.fallen()[~turned].any()
+            assert (torch.linalg.vector_norm(env.com - start, dim=-1)[~turned] < 1.3).all()  # metres
+    assert turned.all()
