@@ -190,14 +190,14 @@ class Location(PDCharacterEnv):
         return (self.episode["final_direction"] - heading).cos() if self.faces else torch.ones_like(heading)
 
 
-def on_arc(way: Tensor) -> Tensor:
+def on_arc(offset: Tensor) -> Tensor:
     """Replace places beyond :data:`STEP` and :data:`ASIDE` by one a step ahead and to their side.
 
     A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall.
 
     Args:
-        way: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
+        offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
     """
-    angle, distance = torch.atan2(way[..., 1], way[..., 0]), torch.linalg.vector_norm(way, dim=-1)
+    angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
     aside = (angle.abs() > ASIDE) & (distance > STEP)
-    return torch.where(aside.unsqueeze(-1), steps(torch.full_like(distance, STEP), ASIDE * angle.sign()), way)
+    return torch.where(aside.unsqueeze(-1), steps(torch.full_like(distance, STEP), ASIDE * angle.sign()), offset)

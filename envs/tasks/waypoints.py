@@ -101,7 +101,7 @@ def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) ->
 
 
 def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
-    """The way to a place as the arguments of :func:`place_seen`, in metres, ``(n, 2)``."""
+    """Like :func:`place_seen`, in metres."""
     return _turned((place - env.com[:, :2])[ids], -env.heading(ids))
 
 
