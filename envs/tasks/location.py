@@ -15,7 +15,7 @@ from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
 from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, logarithmic, near, steps
-from torchrl_mcp.envs.tasks.waypoints import way
+from torchrl_mcp.envs.tasks.waypoints import on_arc, way
 
 STANDING_SPEED = 0.1
 """Speed of the centre of mass in m/s below which a character stands."""
@@ -23,20 +23,14 @@ STANDING_SPEED = 0.1
 FACING = math.cos(math.radians(30))
 """Cosine of the largest angle between the heading and the direction to face for success."""
 
-ASIDE = math.radians(45)
-"""Largest angle in radians from its heading at which a character sees a place."""
-
-STEP = 0.5
-"""Distance in metres of a place that it sees at this angle; it sees nearer places where they are."""
-
 
 class Location(PDCharacterEnv):
     """A character goes to a place and stands there; now and then, it is sent to another.
 
     ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
     distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A place far aside is seen as one a step ahead
-    and aside, so that the character turns on an arc, see :func:`on_arc`. With ``final_directions``, ``goal`` (4) ends
-    with the unit vector of the direction to face at the place. The reward is
+    and aside, so that the character turns on an arc, see :func:`~torchrl_mcp.envs.tasks.waypoints.on_arc`. With
+    ``final_directions``, ``goal`` (4) ends with the unit vector of the direction to face at the place. The reward is
     :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the action could see.
 
     A character has arrived within 0.3 m of the place. Metrics: ``success`` (1, bool) is whether it has arrived and
@@ -188,16 +182,3 @@ class Location(PDCharacterEnv):
         """Cosine of the angle between heading and direction to face, 1 if any will do, ``(N,)``."""
         heading = self.heading()
         return (self.episode["final_direction"] - heading).cos() if self.faces else torch.ones_like(heading)
-
-
-def on_arc(offset: Tensor) -> Tensor:
-    """Replace places beyond :data:`STEP` and :data:`ASIDE` by one a step ahead and to their side.
-
-    A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall.
-
-    Args:
-        offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
-    """
-    angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
-    aside = (angle.abs() > ASIDE) & (distance > STEP)
-    return torch.where(aside.unsqueeze(-1), steps(torch.full_like(distance, STEP), ASIDE * angle.sign()), offset)

@@ -1,5 +1,7 @@
 """Where a character should go next: places on the ground, and how it sees them."""
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -7,7 +9,7 @@ from torch.nn.functional import normalize
 from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
-from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, SUCCESS_REACH, logarithmic, near
+from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, SUCCESS_REACH, logarithmic, near, steps
 
 STRIDE = 1.0
 """Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
@@ -23,6 +25,12 @@ PUSH = 0.5
 
 BEHIND = 0.7
 """Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
+
+ASIDE = math.radians(45)
+"""Largest angle in radians from its heading at which a character sees a place."""
+
+STEP = 0.5
+"""Distance in metres of a place that it sees at this angle; it sees nearer places where they are."""
 
 
 def place_ahead(com: Tensor, velocity: Tensor) -> Tensor:
@@ -103,6 +111,19 @@ def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) ->
 def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
     """Like :func:`place_seen`, in metres."""
     return _turned((place - env.com[:, :2])[ids], -env.heading(ids))
+
+
+def on_arc(offset: Tensor) -> Tensor:
+    """Replace places beyond :data:`STEP` and :data:`ASIDE` by one a step ahead and to their side.
+
+    A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall.
+
+    Args:
+        offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
+    """
+    angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
+    aside = (angle.abs() > ASIDE) & (distance > STEP)
+    return torch.where(aside.unsqueeze(-1), steps(torch.full_like(distance, STEP), ASIDE * angle.sign()), offset)
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

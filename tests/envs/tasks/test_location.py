@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from torchrl_mcp.envs import Location
-from torchrl_mcp.envs.tasks.location import on_arc
 from torchrl_mcp.envs.tasks.rewards import location_reward
+from torchrl_mcp.envs.tasks.waypoints import on_arc
 
 
 def make(num_envs=4, **kwargs):
