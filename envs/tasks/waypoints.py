@@ -109,17 +109,21 @@ def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) ->
 
 
 def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
-    """Like :func:`place_seen`, in metres."""
+    """Like :func:`place_seen`, in metres, ``(n, 2)``."""
     return _turned((place - env.com[:, :2])[ids], -env.heading(ids))
 
 
 def on_arc(offset: Tensor) -> Tensor:
     """Replace places beyond :data:`STEP` and :data:`ASIDE` by one a step ahead and to their side.
 
-    A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall.
+    A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall. The paper has no such task;
+    angle and distance were chosen by falls of the built-in gates.
 
     Args:
         offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
+
+    Returns:
+        Places in the same frame, ``(*B, 2)``, in metres.
     """
     angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
     aside = (angle.abs() > ASIDE) & (distance > STEP)
