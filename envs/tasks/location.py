@@ -15,7 +15,7 @@ from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
 from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, logarithmic, near, steps
-from torchrl_mcp.envs.tasks.waypoints import on_arc, way
+from torchrl_mcp.envs.tasks.waypoints import walkable, way
 
 STANDING_SPEED = 0.1
 """Speed of the centre of mass in m/s below which a character stands."""
@@ -28,9 +28,9 @@ class Location(PDCharacterEnv):
     """A character goes to a place and stands there; now and then, it is sent to another.
 
     ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
-    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A place far aside is seen as one a step ahead
-    and aside, so that the character turns on an arc, see :func:`~torchrl_mcp.envs.tasks.waypoints.on_arc`. With
-    ``final_directions``, ``goal`` (4) ends with the unit vector of the direction to face at the place. The reward is
+    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A place aside is seen as one to which the
+    character can walk, see :func:`~torchrl_mcp.envs.tasks.waypoints.walkable`. With ``final_directions``, ``goal`` (4)
+    ends with the unit vector of the direction to face at the place. The reward is
     :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the action could see.
 
     A character has arrived within 0.3 m of the place. Metrics: ``success`` (1, bool) is whether it has arrived and
@@ -105,7 +105,7 @@ class Location(PDCharacterEnv):
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, the place as it sees it, and metrics."""
-        seen = [logarithmic(on_arc(way(self, self.episode["target"], ids)))]
+        seen = [logarithmic(walkable(way(self, self.episode["target"], ids)))]
         if self.faces:
             angle = self.episode["final_direction"][ids] - self.heading(ids)
             seen.append(steps(torch.ones_like(angle), angle))

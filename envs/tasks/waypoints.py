@@ -27,10 +27,10 @@ BEHIND = 0.7
 """Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
 
 ASIDE = math.radians(45)
-"""Largest angle in radians from its heading at which a character sees a place."""
+"""Largest angle in radians from its heading at which a character sees a place that it goes to."""
 
 STEP = 0.5
-"""Distance in metres of a place that it sees at this angle; it sees nearer places where they are."""
+"""Distance in metres of a place that it sees at this angle."""
 
 
 def place_ahead(com: Tensor, velocity: Tensor) -> Tensor:
@@ -113,11 +113,13 @@ def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor
     return _turned((place - env.com[:, :2])[ids], -env.heading(ids))
 
 
-def on_arc(offset: Tensor) -> Tensor:
-    """Replace places beyond :data:`STEP` and :data:`ASIDE` by one a step ahead and to their side.
+def walkable(offset: Tensor) -> Tensor:
+    """Replace places more than :data:`ASIDE` aside, which a character could face only by turning on the spot.
 
-    A character that goes there turns slowly, on an arc: on the spot, or fast, it may fall. The paper has no such task;
-    angle and distance were chosen by falls of the built-in gates.
+    One beyond :data:`STEP` is seen a step away at this angle, so that the character turns on an arc. One that it has
+    reached, within :data:`ARRIVAL_DISTANCE`, is seen where it stands, so that it does not turn back to what it has
+    overshot. Characters fall when they turn on the spot, the T-Rex most. The paper has no such task; angle and
+    distances were chosen by falls of the built-in gates.
 
     Args:
         offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
@@ -126,8 +128,11 @@ def on_arc(offset: Tensor) -> Tensor:
         Places in the same frame, ``(*B, 2)``, in metres.
     """
     angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
-    aside = (angle.abs() > ASIDE) & (distance > STEP)
-    return torch.where(aside.unsqueeze(-1), steps(torch.full_like(distance, STEP), ASIDE * angle.sign()), offset)
+    on_arc = steps(torch.full_like(distance, STEP), ASIDE * angle.sign())
+    aside, far, reached = (
+        flag.unsqueeze(-1) for flag in (angle.abs() > ASIDE, distance > STEP, distance < ARRIVAL_DISTANCE)
+    )
+    return torch.where(aside & far, on_arc, torch.where(aside & reached, 0.0, offset))
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

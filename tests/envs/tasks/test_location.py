@@ -6,7 +6,7 @@ import torch
 
 from torchrl_mcp.envs import Location
 from torchrl_mcp.envs.tasks.rewards import location_reward
-from torchrl_mcp.envs.tasks.waypoints import on_arc
+from torchrl_mcp.envs.tasks.waypoints import walkable
 
 
 def make(num_envs=4, **kwargs):
@@ -98,11 +98,14 @@ def test_the_goal_is_the_place_in_the_characters_frame_with_a_logarithmic_distan
         ((0.6, 170), (0.5, 45)),
         ((0.4, 170), (0.4, 170)),  # a step back
         ((0.4, -60), (0.4, -60)),
+        ((0.25, 40), (0.25, 40)),
+        ((0.25, -60), (0.0, 0)),  # reached
+        ((0.25, 180), (0.0, 0)),
         ((0.0, 0), (0.0, 0)),
     ],
 )
-def test_a_place_far_aside_is_seen_a_step_ahead(place, seen):
-    torch.testing.assert_close(on_arc(polar(*place)), polar(*seen))
+def test_a_place_aside_is_seen_where_the_character_can_walk(place, seen):
+    torch.testing.assert_close(walkable(polar(*place)), polar(*seen))
 
 
 def test_the_goal_ends_with_the_direction_to_face_if_there_is_one():
