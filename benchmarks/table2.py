@@ -1,6 +1,6 @@
 """Table 2: the runs of the seven methods, archived, with their tables, picture and learning curves.
 
-    torchrl-mcp-train benchmark=table2 preset=comparison benchmark.pretrain_seed=0 seed=0,1 run_root=runs/table2
+    torchrl-mcp-train benchmark=table2 preset=comparison run_root=runs/table2
     python benchmarks/table2.py runs/table2    # archives the complete runs, and writes the results
     python benchmarks/table2.py                # writes the results again, from the archive
 

@@ -34,7 +34,7 @@ class Heading(PDCharacterEnv):
         max_turn: Largest change :math:`\delta` of the direction per step, in radians. Paper: 0.15.
         speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin with 0. Paper: 1.
         speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for none.
-        waypoint: End the goal with a place in the target direction, as :class:`.Location` shows places, see
+        waypoint: End the goal with a place in the target direction, as :func:`.place_seen` shows it, see
             :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`. ``goal_layout`` has its entries.
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
             faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.

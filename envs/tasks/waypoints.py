@@ -94,7 +94,7 @@ def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor
 
 
 def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:
-    """The goal of :class:`.Location` for a place ahead, in the environment of any task.
+    """A place as a gate for :class:`.Location` sees one ahead of it, in the environment of any task.
 
     Args:
         env: The environment.

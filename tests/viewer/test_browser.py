@@ -197,6 +197,8 @@ def test_the_humanoid_walks_to_a_click_and_stands_there_and_obeys_another_click_
         before = place.clone()
         click(page, x, y)
         wait(lambda: (place != before).any(), page)
+        steps = player.steps  # success is of the last place until a step measures it
+        wait(lambda: player.steps > steps + 1, page)
 
     def away():
         return float(torch.linalg.vector_norm(env.com[0, :2] - place))
