@@ -153,8 +153,8 @@ class Dribble(Transport):
         if not self.waypoint:
             return []
         com, _, ball, _, target = self._motion()
-        velocity = self.simulation.state["qvel"][:, -6:-4]  # the last step's is not known after a reset
-        return [place_seen(self, dribble_waypoint(com, ball, velocity, target), ids)]
+        rest = ball + self.simulation.state["qvel"][:, -6:-4] / DAMPING  # the last step's is not known after a reset
+        return [place_seen(self, dribble_waypoint(com, ball, rest, target), ids)]
 
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""

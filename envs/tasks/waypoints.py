@@ -17,11 +17,11 @@ STRIDE = 1.0
 WALK_AHEAD = 1.5
 """Seconds of walking at the target speed to a place ahead: at every step of speed it is beyond arrival."""
 
-LEAD = 1.0
-"""Seconds of its motion by which a character looks ahead of a ball."""
-
 PUSH = 0.5
-"""Distance in metres to walk behind and beyond a ball, and to the side of it."""
+"""Distance in metres to walk behind a ball and to the side of it, and the largest beyond it."""
+
+SHARE = 0.1
+"""Distance to walk beyond a ball, as a share of its distance from the target: the further, the faster they walk."""
 
 BEHIND = 0.7
 """Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
@@ -68,29 +68,31 @@ def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held
     return torch.where(held, bringing, torch.where(done, com, box))
 
 
-def dribble_waypoint(com: Tensor, ball: Tensor, velocity: Tensor, target: Tensor) -> Tensor:
+def dribble_waypoint(com: Tensor, ball: Tensor, rest: Tensor, target: Tensor) -> Tensor:
     """Around the ball until the character is behind it, then through it, then where the character stands.
 
-    The ball is where it will be after :data:`LEAD`. It is left alone where this is at the target, and the character
-    then stands within :data:`SUCCESS_REACH`.
+    The ball is met halfway to where it comes to rest. The nearer this is to the target, the slower it is pushed. A ball
+    that comes to rest at the target is left alone, and the character then stands within :data:`SUCCESS_REACH` of it.
 
     Args:
         com: Centre of mass of the character, ``(N, 2)``, in metres.
         ball: Position of the ball, ``(N, 2)``.
-        velocity: Velocity of the ball, ``(N, 2)``, in m/s.
+        rest: Where the ball comes to rest, ``(N, 2)``.
         target: Position of the target, ``(N, 2)``.
 
     Returns:
         Places, ``(N, 2)``.
     """
-    now, ball = ball, ball + LEAD * velocity
-    onward, approach = normalize(target - ball, dim=-1), normalize(ball - com, dim=-1)
+    now, ball = ball, (ball + rest) / 2
+    way, approach = target - ball, normalize(ball - com, dim=-1)
+    onward = normalize(way, dim=-1)
     left = torch.stack([-onward[:, 1], onward[:, 0]], -1)
     alignment = (approach * onward).sum(-1, keepdim=True)
     side = -(approach * left).sum(-1, keepdim=True).sign() * (alignment < 0)  # of the ball, if it is in the way
-    place = ball + PUSH * torch.where(alignment > BEHIND, onward, side * left - onward)
+    beyond = (SHARE * torch.linalg.vector_norm(way, dim=-1, keepdim=True)).clamp(max=PUSH) * onward
+    place = ball + torch.where(alignment > BEHIND, beyond, PUSH * (side * left - onward))
     standing = torch.where(near(com, now, SUCCESS_REACH).unsqueeze(-1), com, now)
-    return torch.where(near(ball, target, SUCCESS_DISTANCE).unsqueeze(-1), standing, place)
+    return torch.where(near(rest, target, SUCCESS_DISTANCE).unsqueeze(-1), standing, place)
 
 
 def place_seen(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor:

@@ -168,3 +168,21 @@ def test_a_normaliser_keeps_the_entry_and_leaves_the_others_as_they_are():
     narrow.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
     widen_goal(wide, narrow, slice(1, 3))
     torch.testing.assert_close(wide(torch.tensor([3.0, 1.0, 30.0, 4.0])), torch.tensor([3.0, 0.0, 1.0, 4.0]))
+
+
+def test_a_normaliser_learns_the_others_from_the_first_samples_and_goes_on_with_the_entry():
+    generator = torch.Generator().manual_seed(0)
+    before, after = torch.randn(3000, 1, generator=generator), 5 + 2 * torch.randn(1000, 2, generator=generator)
+    narrow, wide = RunningNormaliser(1), RunningNormaliser(2)
+    narrow.update(before)
+    widen_goal(wide, narrow, slice(1, 2))
+    wide.update(after)
+    both = torch.cat([before, after[:, 1:]])
+    torch.testing.assert_close(wide.mean, torch.cat([after[:, :1].mean(0), both.mean(0)]))
+    torch.testing.assert_close(wide.variance, torch.cat([after[:, :1].var(0), both.var(0)]), rtol=2e-3, atol=0)
+    restored = RunningNormaliser(2)
+    restored.load_state_dict(wide.state_dict())
+    for normaliser in (wide, restored):
+        normaliser.update(after + 1)
+    torch.testing.assert_close(restored.state_dict(), wide.state_dict(), rtol=0, atol=0)
+    torch.testing.assert_close(wide.mean[0], after[:, 0].mean() + 0.5)

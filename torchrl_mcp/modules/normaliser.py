@@ -1,6 +1,7 @@
 """Running normalisation of network inputs."""
 
 import warnings
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -48,6 +49,10 @@ class RunningNormaliser(nn.Module):
         self.register_buffer("variance", torch.ones(size))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
+    def count_each(self) -> None:
+        """Count the samples of each feature by itself, ``(F,)``, so that some can begin anew."""
+        self.count.data = self.count.expand_as(self.mean).clone()
+
     def forward(self, x: Tensor) -> Tensor:
         """Normalise ``x``, shape ``(*B, F)``."""
         return ((x - self.mean) * (self.variance + self.epsilon).rsqrt()).clamp(-self.clip, self.clip)
@@ -74,3 +79,9 @@ class RunningNormaliser(nn.Module):
         self.variance.copy_(self.variance + share * (variance - self.variance + (1 - share) * delta.square()))
         self.mean.add_(share * delta)
         self.count.add_(x.shape[0])
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Take statistics with one count, or with one of each feature."""
+        if (count := state_dict.get(f"{prefix}count")) is not None:
+            self.count.data = self.count.new_zeros(count.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args)

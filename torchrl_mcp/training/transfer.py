@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterable
 import torch
 from torch import nn
 
+from torchrl_mcp.modules import RunningNormaliser
+
 
 class FrozenParts:
     """Parts that training must not change, with a check of their bits.
@@ -81,15 +83,18 @@ def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Co
 def widen_goal(wide: nn.Module, narrow: nn.Module, entry: slice) -> None:
     """Copy a network that saw a goal into one that sees it as an entry of its own goal.
 
-    At first, the wide network ignores the other entries: their weights are zero, and normalisers leave them as they
-    are.
+    At first, the wide network ignores the other entries: their weights are zero, and normalisers have no samples of
+    them.
 
     Args:
-        wide: Network whose last inputs are the goal, ``G``.
-        narrow: The same for the goal of the entry's size, whose weights are copied.
+        wide: New network whose last inputs are the goal, ``G``.
+        narrow: The same for the goal of the entry's size, whose weights are copied. Its normalisers count the samples
+            of each feature by itself from then on.
         entry: The entry.
-
     """
+    for module in (*wide.modules(), *narrow.modules()):
+        if isinstance(module, RunningNormaliser):
+            module.count_each()
     for name, tensor in wide.state_dict().items():
         source = narrow.state_dict()[name]
         if tensor.shape == source.shape:

@@ -45,21 +45,26 @@ def test_the_way_of_a_carrier_leads_to_the_box_then_past_the_target_and_ends(tak
 )
 def test_the_way_of_a_dribbler_leads_around_the_ball_and_through_it(ball, expected):
     far = at(1e6, 0.0)
-    place = dribble_waypoint(HERE, at(*ball), torch.zeros(1, 2), far)
+    place = dribble_waypoint(HERE, at(*ball), at(*ball), far)
     torch.testing.assert_close(place, at(*expected), atol=1e-5, rtol=0)
+
+
+def test_a_dribbler_meets_a_rolling_ball_halfway_and_pushes_it_slowly_near_its_target():
+    place = dribble_waypoint(HERE, at(1.0, 0.0), at(3.0, 0.0), at(4.0, 0.0))
+    torch.testing.assert_close(place, at(2.2, 0.0))  # a tenth of the two metres that are left beyond it
 
 
 def test_a_dribbler_waits_for_a_ball_that_rolls_to_its_target():
     target = at(3.9, 0.0)
-    for speed, waits in ((0.0, False), (1.0, False), (2.0, True), (3.0, False)):
-        place = dribble_waypoint(HERE, at(1.9, 0.0), at(speed, 0.0), target)
+    for rest, waits in ((1.9, False), (3.3, False), (3.5, True), (4.3, True), (4.5, False)):
+        place = dribble_waypoint(HERE, at(1.9, 0.0), at(rest, 0.0), target)
         assert torch.equal(place, HERE) == waits
 
 
 def test_a_dribbler_goes_to_a_ball_at_its_target_until_it_is_near():
     for distance, place in ((2.1, at(2.1, 0.0)), (1.9, HERE)):
         ball = at(distance, 0.0)
-        assert torch.equal(dribble_waypoint(HERE, ball, torch.zeros(1, 2), ball + 0.1), place)
+        assert torch.equal(dribble_waypoint(HERE, ball, ball, ball + 0.1), place)
 
 
 @pytest.mark.parametrize(("task", "thing"), [(Carry, "box"), (Dribble, "ball")])
