@@ -75,7 +75,8 @@ def test_the_option_critic_learns_options_that_beat_chance():
     )
     actor, critic = option_critic_actor(parts, num_options=4, epsilon=0.1), option_values(parts, Sizes(2, 4, 2))
     advantages = OptionAdvantages(critic, gamma=0.95, lmbda=0.95, clip=4.0, epsilon=0.1, termination_cost=0.01)
-    losses = OptionCriticLoss(actor.trained, clip_epsilon=0.2, bound_coeff=0.0), OptionValueLoss(critic, coeff=0.5)
+    settings = {"clip_epsilon": 0.2, "bound_coeff": 0.0, "entropy_bonus": False, "functional": False}
+    losses = OptionCriticLoss(actor.trained, **settings), OptionValueLoss(critic, coeff=0.5)
     optimizer = torch.optim.Adam(
         [{"params": actor.trained.parameters(), "lr": 3e-3}, {"params": parts["critic"].parameters(), "lr": 2e-2}]
     )

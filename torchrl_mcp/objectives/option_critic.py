@@ -1,17 +1,15 @@
 """Estimates of the option-critic from trajectories, and its losses."""
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential, dispatch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch import Tensor
-from torchrl.objectives import LossModule
+from torch.distributions import Distribution
 from torchrl.objectives.value import GAE
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
 from torchrl_mcp.objectives.advantages import normalised, reward_scale
+from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 from torchrl_mcp.objectives.values import ValueLoss
 
 
@@ -117,7 +115,7 @@ class OptionValueLoss(ValueLoss):
         return of_option(values, samples["option"])
 
 
-class OptionCriticLoss(LossModule):
+class OptionCriticLoss(BoundedClipPPOLoss):
     r"""The updates of the options and their terminations, as one loss; :class:`OptionValueLoss` is that of the values.
 
     .. math::
@@ -127,108 +125,33 @@ class OptionCriticLoss(LossModule):
 
     with :math:`\rho = \pi_\omega(a|s) / \pi_\omega^{\mathrm{old}}(a|s)`. Samples that are used once have
     :math:`\rho = 1`, and the gradients of the first two terms are those of the intra-option policy gradient theorem and
-    of the termination gradient theorem; the clipped ratio lets samples be used several times. If the options and
-    terminations are frozen, no term remains; if the terminations alone are, ``actor_network`` leaves ``termination``
-    out, and so does the loss.
+    of the termination gradient theorem; the clipped ratio lets samples be used several times. If the terminations are
+    frozen, ``actor_network`` leaves ``termination`` out, and so does the loss.
 
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
             :math:`\beta_\omega(s')`.
-        clip_epsilon: :math:`\epsilon`.
-        bound_coeff: Weight of the penalty on means out of bounds, :math:`c`; 0 for distributions without a mean.
-        bound: Largest absolute mean action, :math:`b`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
 
     Reference:
         Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017, Theorems 1 and 2 and Algorithm 1.
         https://arxiv.org/abs/1609.05140
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that ``set_keys`` changes."""
-
-        action: NestedKey = "action"
-        sample_log_prob: NestedKey = "action_log_prob"
-        option: NestedKey = "option"
-        termination: NestedKey = "termination"
-        advantage: NestedKey = "advantage"
-        termination_advantage: NestedKey = "termination_advantage"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        clip_epsilon: float,
-        bound_coeff: float,
-        bound: float = 1.0,
-    ) -> None:
-        super().__init__()
-        self.actor_network = actor_network
-        self.clip_epsilon, self.bound_coeff, self.bound = clip_epsilon, bound_coeff, bound
-
-    @property
-    def functional(self) -> bool:
-        """False: the parameters stay in the networks."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys of a sample that the loss reads."""
-        keys = self.tensor_keys
-        estimates = [keys.sample_log_prob, keys.option, keys.advantage, keys.termination_advantage]
-        return list(dict.fromkeys([keys.action, *self.actor_network.in_keys, *estimates]))
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of the terms that the loss returns."""
-        if not self._learns_options():
-            return []
-        terminations = ["loss_termination"] if self._learns_terminations() else []
-        statistics = ["kl_approx", "clip_fraction", "mean_ratio", "max_ratio", "ESS"]
-        return ["loss_objective", *terminations, "loss_bound", *statistics]
-
-    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the terms of the loss and statistics of the update, as scalars."""
-        return TensorDict(self._losses(tensordict) if self._learns_options() else {})
+        """Add ``loss_termination`` to the terms of the bounded loss."""
+        out = super().forward(tensordict)
+        if "termination" in self.actor_network.out_keys:
+            regret = tensordict["termination_advantage"].squeeze(-1)
+            out["loss_termination"] = (self._termination * regret).mean()
+            del self._termination
+        return out
 
-    def _losses(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        keys = self.tensor_keys
-        outputs = self.actor_network.get_dist_params(tensordict.select(*self.actor_network.in_keys))
-        distribution = self.actor_network.build_dist_from_params(outputs)
-        log_ratio = distribution.log_prob(tensordict[keys.action]) - tensordict[keys.sample_log_prob]
-        ratio, advantage = log_ratio.exp(), tensordict[keys.advantage].squeeze(-1)
-        clipped = ratio.clamp(1 - self.clip_epsilon, 1 + self.clip_epsilon)
-        terms = {"loss_objective": -torch.minimum(ratio * advantage, clipped * advantage).mean()}
-        if self._learns_terminations():
-            regret = tensordict[keys.termination_advantage].squeeze(-1)
-            terms["loss_termination"] = (outputs[keys.termination] * regret).mean()
-        bound = self._bound_penalty(distribution, advantage)
-        return {**terms, "loss_bound": bound, **_update_report(log_ratio.detach(), self.clip_epsilon)}
-
-    def _bound_penalty(self, distribution: Any, like: Tensor) -> Tensor:
-        if not self.bound_coeff:
-            return like.new_zeros(())
-        excess = (distribution.mean.abs() - self.bound).relu()
-        return self.bound_coeff * excess.square().sum(-1).mean()
-
-    def _learns_options(self) -> bool:
-        return any(parameter.requires_grad for parameter in self.actor_network.parameters())
-
-    def _learns_terminations(self) -> bool:
-        return self.tensor_keys.termination in self.actor_network.out_keys
-
-
-def _update_report(log_ratio: Tensor, clip_epsilon: float) -> dict[str, Tensor]:
-    """Compare the policy with the one that drew the samples, by the same statistics as TorchRL's PPO loss."""
-    ratio = log_ratio.exp()
-    return {
-        "kl_approx": -log_ratio.mean(),
-        "clip_fraction": ((ratio - 1).abs() > clip_epsilon).float().mean(),
-        "mean_ratio": ratio.mean(),
-        "max_ratio": ratio.max(),
-        "ESS": ratio.sum().square() / ratio.square().sum() / ratio.numel(),
-    }
+    def _get_cur_log_prob(
+        self, tensordict: TensorDictBase, params: TensorDictParams | None = None
+    ) -> tuple[Tensor, Distribution, bool]:
+        outcome = super()._get_cur_log_prob(tensordict, params)
+        # The networks have just written their outputs.
+        if "termination" in self.actor_network.out_keys:
+            self._termination = tensordict["termination"]
+        return outcome

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams
 from torch import Tensor
@@ -19,7 +20,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     Args:
         actor_network: The policy.
         critic_network: The value function, or None if it has its own loss.
-        bound_coeff: Weight of the penalty, :math:`c`.
+        bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean.
         bound: Largest absolute mean action, :math:`b`.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
 
@@ -44,9 +45,12 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_bound`` to the terms of the clipped loss."""
         out = super().forward(tensordict)
-        excess = (self._distribution.mean.abs() - self.bound).relu()
+        penalty = torch.zeros_like(out["loss_objective"])
+        if self.bound_coeff:
+            excess = (self._distribution.mean.abs() - self.bound).relu()
+            penalty = self.bound_coeff * excess.square().sum(-1).mean()
         del self._distribution
-        return out.set("loss_bound", self.bound_coeff * excess.square().sum(-1).mean())
+        return out.set("loss_bound", penalty)
 
     def _get_cur_log_prob(
         self, tensordict: TensorDictBase, params: TensorDictParams | None = None
