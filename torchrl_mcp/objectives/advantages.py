@@ -1,5 +1,7 @@
 """Advantages and value targets for a batch of trajectories."""
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -33,30 +35,63 @@ class Advantages:
     out_keys = ("advantage", "value_target", "state_value")
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
-        self.critic = critic
-        self.reward_scale = reward_scale(gamma)
-        self.clip = clip
-        self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+        self.critic, self.clip = critic, clip
+        self.gae = ScaledGAE(gamma, lmbda)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Add ``advantage`` and ``value_target``, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
-        value = self.critic(batch.select("observation", "goal")).get("state_value").float()
-        next_value = torch.cat([value[:, 1:], torch.zeros_like(value[:, :1])], dim=1)
-        cut = batch["next", "truncated"].squeeze(-1).clone()
-        cut[:, -1] = True
-        next_value[cut] = self.critic(batch["next"][cut].select("observation", "goal"))["state_value"].float()
+        value = self._values(batch)
+        advantage, batch["value_target"] = self.gae(batch, value, upon_arrival(value, batch, self._values))
+        batch["advantage"] = normalised(advantage, self.clip)
+        batch["state_value"] = value
+        return batch
 
+    def _values(self, states: TensorDictBase) -> Tensor:
+        return self.critic(states.select("observation", "goal"))["state_value"].float()
+
+
+class ScaledGAE:
+    r"""TorchRL's GAE(:math:`\lambda`) of rewards that are scaled by :math:`1 - \gamma`.
+
+    Args:
+        gamma: Discount factor.
+        lmbda: Decay of the estimators.
+
+    Raises:
+        ValueError: If ``gamma`` is not at least 0 and below 1.
+    """
+
+    def __init__(self, gamma: float, lmbda: float) -> None:
+        self.reward_scale = reward_scale(gamma)
+        self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+
+    def __call__(self, batch: TensorDictBase, value: Tensor, next_value: Tensor) -> tuple[Tensor, Tensor]:
+        """Return advantages and targets of values of trajectories ``(N, T)``, like the values ``(N, T, 1)`` each."""
         trajectories = batch.select(("next", "done"), ("next", "terminated"))
         trajectories["state_value"] = value
         trajectories["next", "state_value"] = next_value
         trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
-        self.gae(trajectories)
+        self.estimator(trajectories)
+        return trajectories["advantage"], trajectories["value_target"]
 
-        batch["advantage"] = normalised(trajectories["advantage"], self.clip)
-        batch["value_target"] = trajectories["value_target"]
-        batch["state_value"] = value
-        return batch
+
+def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[TensorDictBase], Tensor]) -> Tensor:
+    """Return values of the states in which the steps of trajectories end, ``(N, T, F)``.
+
+    They are those of the following samples. After a time limit and at the end of the batch, no sample of the same
+    episode follows, and the stored next state is evaluated. After a terminated episode they have no meaning.
+
+    Args:
+        values: Values of the states in which the steps begin, ``(N, T, F)``.
+        batch: The trajectories, ``(N, T)``.
+        evaluate: From states ``(M,)`` to values ``(M, F)``.
+    """
+    cut = batch["next", "truncated"].squeeze(-1).clone()
+    cut[:, -1] = True
+    arrived = values.roll(-1, dims=1)
+    arrived[cut] = evaluate(batch["next"][cut])
+    return arrived
 
 
 def normalised(advantage: Tensor, clip: float) -> Tensor:

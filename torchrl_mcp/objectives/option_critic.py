@@ -5,10 +5,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl.objectives.value import GAE
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
-from torchrl_mcp.objectives.advantages import normalised, reward_scale
+from torchrl_mcp.objectives.advantages import ScaledGAE, normalised, upon_arrival
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 from torchrl_mcp.objectives.values import ValueLoss
 
@@ -59,39 +58,29 @@ class OptionAdvantages:
         epsilon: float,
         termination_cost: float,
     ) -> None:
-        self.critic = critic
-        self.reward_scale, self.clip = reward_scale(gamma), clip
+        self.critic, self.clip = critic, clip
         self.epsilon, self.termination_cost = epsilon, termination_cost
-        self.gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+        self.gae = ScaledGAE(gamma, lmbda)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Add the estimates, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
-        option = batch["option"]
-        values, terminations = self._criticised(batch)
-        cut = batch["next", "truncated"].squeeze(-1).clone()
-        cut[:, -1] = True
-        arrived_values, arrived_terminations = values.roll(-1, dims=1), terminations.roll(-1, dims=1)
-        arrived_values[cut], arrived_terminations[cut] = self._criticised(batch["next"][cut])
-        kept = of_option(arrived_values, option)
-        chosen = (EpsilonGreedy(arrived_values, self.epsilon).probs * arrived_values).sum(-1, keepdim=True)
-
-        trajectories = batch.select(("next", "done"), ("next", "terminated"))
-        trajectories["state_value"] = of_option(values, option)
-        trajectories["next", "state_value"] = kept - of_option(arrived_terminations, option) * (kept - chosen)
-        trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
-        self.gae(trajectories)
-
-        batch["advantage"] = normalised(trajectories["advantage"], self.clip)
-        batch["value_target"] = trajectories["value_target"]
-        regret = (kept - chosen) / self.reward_scale + self.termination_cost
+        option, here = batch["option"], self._criticised(batch)
+        values, terminations = upon_arrival(here, batch, self._criticised).chunk(2, dim=-1)
+        kept = of_option(values, option)
+        chosen = (EpsilonGreedy(values, self.epsilon).probs * values).sum(-1, keepdim=True)
+        value = of_option(here.chunk(2, dim=-1)[0], option)
+        next_value = kept - of_option(terminations, option) * (kept - chosen)
+        advantage, batch["value_target"] = self.gae(batch, value, next_value)
+        batch["advantage"] = normalised(advantage, self.clip)
+        regret = (kept - chosen) / self.gae.reward_scale + self.termination_cost
         batch["termination_advantage"] = regret * ~batch["next", "terminated"]
         return batch
 
-    def _criticised(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Values and terminations of all options, each ``(*B, K)``."""
+    def _criticised(self, states: TensorDictBase) -> Tensor:
+        """Values of all options, then their terminations, ``(*B, 2 K)``."""
         criticised = self.critic(states.select("observation", "goal"))
-        return criticised["option_values"].float(), criticised["terminations"].float()
+        return torch.cat([criticised["option_values"], criticised["terminations"]], dim=-1).float()
 
 
 class OptionValueLoss(ValueLoss):
