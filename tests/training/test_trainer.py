@@ -99,7 +99,7 @@ def test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit
     for frames in (128, 256):
         cut = tmp_path / str(frames)
         shutil.copytree(whole, cut)
-        for path in sorted((cut / checkpoint.FOLDER).iterdir()):
+        for path in sorted((cut / checkpoint.CHECKPOINTS).iterdir()):
             if run_folder.frames(path) > frames:
                 path.unlink()
         experiment.resume(cut)
@@ -260,7 +260,7 @@ def test_in_the_warm_up_normalisers_and_critic_learn_and_the_policy_waits(tmp_pa
     experiment.train(configure(tmp_path, *settings, "training.total_frames=256"))
     start, warm, first = (
         policies.restore(path, num_envs=1, seed=0)[1].parts.state_dict()
-        for path in sorted((tmp_path / checkpoint.FOLDER).iterdir())
+        for path in sorted((tmp_path / checkpoint.CHECKPOINTS).iterdir())
     )
     for name in start:
         learns_first = name.startswith(("critic", "observation_normaliser", "goal_normaliser"))

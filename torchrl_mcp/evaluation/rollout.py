@@ -24,7 +24,8 @@ class Evaluation:
         returns: Undiscounted sum of the task's own rewards of each episode, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
-        positions: Horizontal position of the root after every step, ``(T, N, 2)`` in metres; NaN after its episode.
+        positions: Horizontal position of the root after every step but an episode's last, ``(T, N, 2)`` in metres; from
+            there on NaN.
         metrics: Other measurements of the task by name, ``(N,)``: for a flag such as ``success``, whether it was ever
             raised in the episode; for a number such as ``tracking_error``, its mean over the steps.
         decisions: Recorded outputs of the policy, for all steps of all episodes, batch size ``(M,)``.
@@ -113,8 +114,8 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
         fraction, ``metrics``; if the task has it, ``reach``: the returns ``standing`` and ``ideal``, and the
-        ``place`` between them, from 0 to 1), the standard deviation over episodes (0 of a single one), and a 95 %
-        percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
+        ``place``, 0 at the one and 1 at the other), the standard deviation over episodes (0 of a single one), and a
+        95 % percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
     """
     normalised = normalised_return(outcome.returns)
     estimate = mean(normalised.tolist())

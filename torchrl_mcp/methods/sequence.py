@@ -71,8 +71,8 @@ class GatesInARow(TensorDictModuleBase):
         self.env, self.acts, self.activation = env, tuple(acts), gate_activation
         self.composite = DeterministicAction(distribution_class)
         self.rate = min(1.0, env.control_timestep / crossfade) if crossfade else 1.0
-        self.act = torch.zeros(env.num_envs, dtype=torch.long)
-        self.shares = torch.zeros(env.num_envs, len(acts))
+        self.act = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+        self.shares = torch.zeros(env.num_envs, len(acts), device=env.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``gates`` ``(N, K)`` and the deterministic ``action`` ``(N, A)`` for ``observation`` and ``goal``."""
@@ -89,7 +89,7 @@ class GatesInARow(TensorDictModuleBase):
         began = self.env.episode["elapsed_steps"].flatten() == 0
         never = torch.zeros_like(began)
         over = torch.stack([act.until(self.env) if act.until else never for act in self.acts])
-        over = over[self.act, torch.arange(len(self.act))]
+        over = over.gather(0, self.act.unsqueeze(0)).squeeze(0)
         self.act = torch.where(began, 0, (self.act + over.long()).clamp(max=len(self.acts) - 1))
         wanted = nn.functional.one_hot(self.act, len(self.acts)).float()
         faded = self.shares + (wanted - self.shares).clamp(-self.rate, self.rate)

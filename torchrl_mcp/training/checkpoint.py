@@ -20,8 +20,6 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, 
 
 from torchrl_mcp.training.run_folder import CHECKPOINT, CHECKPOINTS, find_all, replacing
 
-FOLDER = CHECKPOINTS
-
 DAMAGED = ".damaged"
 """Suffix of the name of a checkpoint that could not be restored."""
 
@@ -73,8 +71,8 @@ def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:
     return Checkpoint(format="archive", **{_component(name): part for name, part in parts.items()}, **components)
 
 
-def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None = None) -> None:
-    """Restore ``components`` of ``checkpoint``, or all, from the file ``path``.
+def load(checkpoint: Checkpoint, path: Path) -> None:
+    """Restore ``checkpoint`` from the file ``path``.
 
     Raises:
         ValueError: If the file is missing, truncated, damaged, of another kind, or does not fit.
@@ -86,7 +84,7 @@ def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None 
     torchrl_logger.setLevel(ERROR)  # it also warns of another build of a version, as for CUDA
     try:
         _require_plain_data(path)
-        report = checkpoint.load(path, components=components, map_location="cpu")
+        report = checkpoint.load(path, map_location="cpu")
     except UNREADABLE as error:
         _raise_passing(error)
         raise ValueError(
@@ -126,7 +124,7 @@ def load_agent(parts: nn.ModuleDict, path: Path, optional: Collection[str] = ("c
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
     """Return the rotation of a run folder's checkpoints, which keeps the newest ``keep_last``."""
-    return CheckpointRotation(run / FOLDER, keep_last=keep_last)
+    return CheckpointRotation(run / CHECKPOINTS, keep_last=keep_last)
 
 
 def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
@@ -154,7 +152,7 @@ def find(path: Path) -> Path:
         return path
     if saved := find_all(path):
         return saved[0]
-    raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {FOLDER}/")
+    raise ValueError(f"{path} is neither a checkpoint file nor a run folder with one in {CHECKPOINTS}/")
 
 
 def is_intact(path: Path) -> bool:

@@ -149,7 +149,7 @@ class Trainer:
         """
         load(self.checkpoint, path)
         if not self.source.resumes_episodes:
-            self.episodes = EpisodeStatistics(self.source.num_envs)
+            self.episodes.load_state_dict(EpisodeStatistics(self.source.num_envs).state_dict())
         self.metrics_writer.rewind(self.progress.iteration)
 
     def save(self) -> None:
