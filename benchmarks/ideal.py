@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from report import about, table, write
 
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 
 RESULTS = Path(__file__).resolve().parent / "results" / "ideal.csv"
 VARIANTS: list[tuple[str, str, dict[str, Any]]] = [
@@ -38,9 +38,8 @@ VARIANTS: list[tuple[str, str, dict[str, Any]]] = [
 def rows(episodes: int) -> Iterator[dict[str, Any]]:
     """Draw episodes of each variant, and yield their bounds."""
     for task, character, changes in VARIANTS:
-        with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-            stage = "pretrain" if task == "holdout" else "transfer"
-            cfg = compose("train", [f"task={task}", f"character={character}", f"stage={stage}"])
+        stage = "pretrain" if task == "holdout" else "transfer"
+        cfg = compose_run(f"task={task}", f"character={character}", f"stage={stage}")
         evaluated: Any = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
         env = build.make_env(cfg, num_envs=episodes, seed=12345, **evaluated | changes)
         env.reset()

@@ -41,3 +41,15 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
+
+
+def peak_memory(pid: int) -> float:
+    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
+    total = 0.0
+    with suppress(OSError):
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+            if line.startswith("VmHWM"):
+                total = int(line.split()[1]) / 1024
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            total += sum(peak_memory(int(child)) for child in (task / "children").read_text().split())
+    return total

@@ -30,13 +30,13 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
 from report import about, table, write
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.precision import choose
 from torchrl_mcp.training.trainer import Trainer
 
@@ -87,8 +87,7 @@ def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
         "progress_bar": False,
         "run_dir": ".",
     }
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [collector, *(f"{key}={value}" for key, value in settings.items())])
+    cfg = compose_run(collector, *(f"{key}={value}" for key, value in settings.items()))
     if workers:
         cfg.collector.num_workers = workers
     source = build.make_source(cfg)

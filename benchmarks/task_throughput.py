@@ -34,7 +34,6 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import mujoco
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from mujoco.batch import Batch
 from report import about, table, write
@@ -43,6 +42,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp import envs
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.policies import restore
 
 RESULTS = Path(__file__).resolve().parent / "results" / "task_throughput.csv"
@@ -66,8 +66,7 @@ def make(task: str, character: str, **kwargs: Any) -> envs.PDCharacterEnv:
     """Environments of a task; imitation uses the generated corpus and the reward of its configuration."""
     if task != "Imitation":
         return getattr(envs, task)(character=character, **kwargs)
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", ["task=imitation", f"character={character}"])
+    cfg = compose_run("task=imitation", f"character={character}")
     return instantiate(cfg.task.pretrain)(**kwargs)
 
 

@@ -29,7 +29,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from report import about, table, write
+from report import about, peak_memory, table, write
 
 RESULTS = Path(__file__).parent / "results" / "throughput_env.csv"
 SUBSTEPS = 5
@@ -144,18 +144,6 @@ CONTENDERS: dict[str, tuple[Callable[[int], Step], tuple[int, ...]]] = {
     "TorchRL AntEnv, RK4": (partial(torchrl_ant, integrator="RK4"), (1, CPUS, CPUS, 1)),
 }
 """Constructor of each contender, and its number of environments in each turn."""
-
-
-def peak_memory(pid: int) -> float:
-    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
-    total = 0.0
-    with suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("VmHWM"):
-                total = int(line.split()[1]) / 1024
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            total += sum(peak_memory(int(child)) for child in (task / "children").read_text().split())
-    return total
 
 
 def worker(name: str, num_envs: int) -> None:

@@ -31,7 +31,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
-from report import about, table, write
+from report import about, peak_memory, table, write
 
 SCRIPT = Path(__file__).resolve()
 RESULTS = SCRIPT.parent / "results" / "training_throughput.csv"
@@ -157,18 +157,6 @@ def worker(name: str, training: dict[str, int], threads: int) -> None:
     torch.set_num_threads(threads)
     family, kind, detail = name.split("-")
     {"ours": ours, "before": ours, "sb3": sb3}[family](kind, detail, training)
-
-
-def peak_memory(pid: int) -> float:
-    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
-    total = 0.0
-    with suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("VmHWM"):
-                total = int(line.split()[1]) / 1024
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            total += sum(peak_memory(int(child)) for child in (task / "children").read_text().split())
-    return total
 
 
 def iterate(name: str, process: subprocess.Popen) -> Iteration:
