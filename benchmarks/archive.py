@@ -128,10 +128,10 @@ def label(cell: Cell) -> str:
 def line(cell: Cell) -> dict[str, Any]:
     """Return a row of the table of a task."""
     chosen = [run.evaluation["deterministic"] for run in cell.complete]
-    deviation = f" ± {cell.deviation():.3f}" if len(chosen) > 1 else ""
+    deviation = f" ± {cell.deviation():.3f}" if len(cell.by_seed) > 1 else ""
     facts: dict[str, Any] = {
         "": label(cell),
-        "seeds": len(chosen),
+        "seeds": len(cell.by_seed),
         "steps": f"{cell.complete[0].frames:,}",
         "deterministic": f"{average(cell.returns()):.3f}{deviation}",
         "stochastic": f"{average(cell.returns('stochastic')):.3f}",
@@ -159,8 +159,8 @@ def minutes_to_most(cell: Cell) -> float:
 
 
 def learning_curve(cell: Cell) -> Curve:
-    """Return the learning curve of a cell, in bins of its own steps."""
-    (curve,) = learning_curves({label(cell): [run.path for run in cell.complete]})
+    """Return the learning curve of a cell, of the first run of each seed, in bins of its own steps."""
+    (curve,) = learning_curves({label(cell): [runs[0].path for runs in cell.by_seed.values()]})
     return curve
 
 
@@ -169,7 +169,7 @@ def score(cell: Cell | None) -> str:
     if cell is None:
         return EMPTY
     success = f", {share(cell)}" if share(cell) else EMPTY
-    return f"{average(cell.returns()):.3f}{success} ({len(cell.complete)})"
+    return f"{average(cell.returns()):.3f}{success} ({len(cell.by_seed)})"
 
 
 def share(cell: Cell) -> str:

@@ -71,7 +71,7 @@ def summary(found: Sequence[Cell]) -> Iterator[dict[str, Any]]:
             "best other that pre-trains": f"{named}{brief(other)}",
             "scratch, all steps": brief(scratch),
             "paper's MCP": f"{TABLE_2[*place, 'mcp'].mean:.3f}",
-            "seeds": ", ".join(str(len(cell.complete)) if cell else "0" for cell in cells) if mcp else EMPTY,
+            "seeds": ", ".join(str(len(cell.by_seed)) if cell else "0" for cell in cells) if mcp else EMPTY,
         }
 
 

@@ -137,6 +137,18 @@ def test_a_run_that_goes_on_for_longer_is_in_the_table_and_not_among_the_curves(
     assert [f"<!-- {name} -->" in drawn for name in names] == [True, True, False]
 
 
+def test_a_seed_that_is_stored_twice_is_one_seed_of_a_table(tmp_path, run_writers, monkeypatch):
+    _, write_mcp = run_writers(tmp_path / "runs")
+    for name, seed, score in (("a", 0, 0.4), ("b", 0, 0.4), ("c", 1, 0.8)):
+        write_mcp(name, seed=seed, score=score)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path / "results")
+    assert "0.600 (2)" in (tmp_path / "results/table.md").read_text()
+    head, row = cells_of((tmp_path / "results/heading_biped.md").read_text())
+    found = dict(zip(head, row, strict=True))
+    assert (found["seeds"], found["deterministic"]) == ("2", "0.600 ± 0.283")
+    assert "MCP (2 seeds)" in (tmp_path / "results/heading_biped.svg").read_text()
+
+
 def test_the_archive_gives_the_same_results_again(results, tmp_path, monkeypatch):
     again = tmp_path / "again"
     again.mkdir()

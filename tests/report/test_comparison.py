@@ -133,9 +133,24 @@ def test_a_single_seed_has_the_interval_of_its_episodes(write_run):
     assert cell.remarks == ["one seed: the interval is over its episodes"]
 
 
+def test_a_seed_that_is_stored_twice_counts_once(write_run):
+    twice = write_run("a", score=0.4), write_run("b", score=0.6)
+    (one,) = grouped(*twice)
+    assert (one.mean().value, one.mean().low, one.mean().high) == pytest.approx((0.5, 0.48, 0.52))
+    assert one.spread == ""
+    assert one.remarks == ["one seed: the interval is over its episodes", "seed 0 occurs more than once"]
+    (two,) = grouped(*twice, write_run("c", seed=1, score=0.8))
+    assert two.returns("stochastic") == pytest.approx([0.4, 0.7])
+    assert (two.mean().value, two.mean().low, two.mean().high) == pytest.approx((0.65, 0.5, 0.8))
+    assert two.spread == "range "
+    assert two.deviation() == pytest.approx(0.3 / math.sqrt(2))
+    assert (len(two.by_seed), two.begun) == (2, 2)
+
+
 def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_run):
     (cell,) = grouped(write_run("a", score=0.5), write_run("b", score=0.5, episodes=32))
     assert cell.remarks == [
+        "one seed: the interval is over its episodes",
         "seed 0 occurs more than once",
         "mixed evaluations: 128 episodes of seed 12345, 32 episodes of seed 12345",
     ]

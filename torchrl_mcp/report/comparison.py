@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import fmean
 from typing import Any, TypeVar
 
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
@@ -44,6 +45,16 @@ class Cell:
         """Runs that are trained and evaluated; means leave out the others."""
         return [run for run in self.runs if run.state == "complete"]
 
+    @cached_property
+    def by_seed(self) -> dict[int, list[Run]]:
+        """Complete runs by seed: several if benchmarks that share a folder stored the same run."""
+        return _grouped(self.complete, lambda run: run.seed)
+
+    @property
+    def begun(self) -> int:
+        """Number of seeds with a run in any state."""
+        return len({run.seed for run in self.runs})
+
     @property
     def title(self) -> str:
         """Title of the method."""
@@ -69,20 +80,21 @@ class Cell:
         return TABLE_2.get((*self.place, self.method)) if comparable else None
 
     def returns(self, mode: str = "deterministic") -> list[float]:
-        """Normalised returns of the complete runs, each a mean over episodes."""
-        return [run.evaluation[mode]["normalised_return"] for run in self.complete]
+        """Normalised returns by seed, each a mean over the episodes of its complete runs."""
+        return [fmean(run.evaluation[mode]["normalised_return"] for run in runs) for runs in self.by_seed.values()]
 
     def mean(self, mode: str = "deterministic") -> Estimate | None:
         """Mean over seeds with its interval; for a single seed, the interval is over its episodes."""
-        if len(self.complete) == 1:
-            numbers = self.complete[0].evaluation[mode]
-            return Estimate(numbers["normalised_return"], *numbers["interval"])
-        return mean(self.returns(mode)) if self.complete else None
+        returns = self.returns(mode)
+        if len(returns) == 1:
+            intervals = (run.evaluation[mode]["interval"] for run in self.complete)
+            return Estimate(*returns, *map(fmean, zip(*intervals, strict=True)))
+        return mean(returns) if returns else None
 
     @property
     def spread(self) -> str:
         """Name of the mean's interval: a bootstrap of two or three seeds is their range."""
-        return "range " if len(self.complete) in (2, 3) else ""
+        return "range " if len(self.by_seed) in (2, 3) else ""
 
     def deviation(self, mode: str = "deterministic") -> float:
         """Standard deviation over seeds, NaN of fewer than two."""
@@ -135,7 +147,7 @@ class Cell:
         seeds = [run.seed for run in self.runs]
         return [
             *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
-            *(["one seed: the interval is over its episodes"] if len(self.complete) == 1 else []),
+            *(["one seed: the interval is over its episodes"] if len(self.by_seed) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(f"mixed {found}" for found in _mixed("evaluations", _protocols(self.complete))),
             *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),

@@ -1,6 +1,7 @@
 """Table 2 as a picture: a panel for each row, with our returns beside the paper's."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -43,7 +44,7 @@ def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
 
 def average(cell: Cell) -> float:
     """Return the mean deterministic return over seeds."""
-    return sum(cell.returns()) / len(cell.complete)
+    return fmean(cell.returns())
 
 
 def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
@@ -81,7 +82,7 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
         if method in found:
             cell = found[method]
             axes.barh(position - BAR / 2, average(cell), BAR, color=COLOURS[0])
-            axes.plot(cell.returns(), [position - BAR / 2] * len(cell.complete), ".", color=INK, markersize=3)
+            axes.plot(cell.returns(), [position - BAR / 2] * len(cell.by_seed), ".", color=INK, markersize=3)
             if "success" in cell.metrics:
                 end = max(*cell.returns(), 0.0) + 0.03
                 share = f"{cell.metrics['success']:.0%}"
