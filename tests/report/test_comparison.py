@@ -108,6 +108,13 @@ def test_an_argument_that_only_some_runs_name_tells_them_apart(write_run):
     assert told == {0: {"task.transfer.max_turn": "default"}, 1: {"task.transfer.max_turn": 0.3}}
 
 
+@pytest.mark.parametrize("setting", ["motions.seed", "imitation.switch_to"])
+def test_a_pretraining_tells_transfers_apart_that_keep_its_networks(write_run, write_mcp, setting):
+    for write, expected in ((write_run, 1), (write_mcp, 2)):
+        folders = [write(f"{expected}{value}", seed=value, **{setting.replace(".", "__"): value}) for value in (0, 1)]
+        assert len(grouped(*folders)) == expected
+
+
 def test_only_complete_runs_count_and_the_others_are_remarked(write_run):
     (cell,) = grouped(
         write_run("a", score=0.5),
@@ -165,6 +172,26 @@ def test_evaluations_in_different_tasks_are_remarked(write_run):
     )
     assert cell.remarks == [f"mixed {told}"]
     assert caveats([cell]) == [told]
+
+
+@pytest.mark.parametrize(
+    ("sources", "told"),
+    [
+        (("runs/mcp/seed0", "runs/mcp/seed1"), []),
+        ([f"runs/mcp/seed{seed}/checkpoints/checkpoint-000000004096.torchrl" for seed in (0, 1)], []),
+        (
+            [f"checkpoint-00000000{steps}.torchrl" for steps in (4096, 8192)],
+            ["mixed pre-trainings: checkpoint-000000004096.torchrl, checkpoint-000000008192.torchrl"],
+        ),
+        (("networks/mcp-biped-0.torchrl", "networks/mcp-biped-1.torchrl"), []),
+        (("runs/mcp/seed0", "runs/longer/seed1"), ["mixed pre-trainings: runs/longer, runs/mcp"]),
+        (("builtin:biped", None), ["mixed pre-trainings: builtin:biped, none"]),
+    ],
+    ids=str,
+)
+def test_seeds_that_begin_with_different_pretrainings_are_remarked(write_mcp, sources, told):
+    (cell,) = grouped(*(write_mcp(str(i), seed=i, score=0.5, pretrained=source) for i, source in enumerate(sources)))
+    assert cell.remarks == told
 
 
 def test_a_method_s_own_settings_are_standard_in_both_stages(write_mcp):

@@ -1,6 +1,7 @@
 """Comparison of runs: groups of seeds to average, their differences, and the paper's numbers."""
 
 import math
+import re
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +12,16 @@ from typing import Any, TypeVar
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
 from torchrl_mcp.report.paper import METHODS, PLACES, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
-from torchrl_mcp.runs.identity import UNLEARNT, is_among
+from torchrl_mcp.runs.identity import PRETRAINING, UNLEARNT, is_among
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
 
 DEFAULT = "default"
 """Value of an argument that a run's configuration does not set."""
+
+SEED = re.compile(r"/seed\d+(?=/|$)|-\d{1,3}(?=\.torchrl$)")
+"""The seed in the path of a run folder, or in the name of published networks; a checkpoint's steps have more digits."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +154,7 @@ class Cell:
             *(["one seed: the interval is over its episodes"] if len(self.by_seed) == 1 else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(f"mixed {found}" for found in _mixed("evaluations", _protocols(self.complete))),
+            *(f"mixed {found}" for found in _mixed("pre-trainings", map(_pretraining, self.runs))),
             *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),
         ]
 
@@ -274,7 +279,8 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
 def _learned(run: Run) -> dict[str, Any]:
     """Settings of a run that may affect learning."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
-    ignored = UNLEARNT | {other_stage} | (set() if _explores(run) else {"exploration"})
+    counted = PRETRAINING if run.stage == "transfer" and run.settings.get("transfer.keep") else set()
+    ignored = UNLEARNT - counted | {other_stage} | (set() if _explores(run) else {"exploration"})
     return {name: value for name, value in run.settings.items() if not is_among(name, ignored)}
 
 
@@ -333,6 +339,11 @@ def _protocols(runs: Sequence[Run]) -> list[str]:
         + "".join(f" with {name}={environment[name]}" for name in telling)
         for run, environment in zip(runs, environments, strict=True)
     ]
+
+
+def _pretraining(run: Run) -> str:
+    """Where the networks that a run began with come from, without their seed."""
+    return SEED.sub("", str(run.settings.get("pretrained") or "none"))
 
 
 def _mixed(name: str, values: Iterable[str]) -> list[str]:

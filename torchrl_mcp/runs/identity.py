@@ -38,6 +38,9 @@ ENVIRONMENTS = frozenset(
 UNLEARNT = CONDUCT | PLACES | ENVIRONMENTS | {"autocast", "seed"}
 """Settings that are ignored when results are compared: runs that differ only in them are averaged."""
 
+PRETRAINING = frozenset({"imitation", "motions"})
+"""Settings of :data:`UNLEARNT` that a transfer learns from if it keeps networks: those of their pre-training."""
+
 TRANSFER_ONLY = frozenset(
     {"budget.scratch", "budget.transfer", "exploration", "curriculum", "pretrained", "transfer.freeze", "transfer.keep"}
 )
