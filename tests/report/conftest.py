@@ -46,6 +46,7 @@ def write(
     total_frames=1000,
     commit="abc1234",
     preset="fast",
+    symmetry="none",
     diagnostics=(),
     episodes=128,
     environment=None,
@@ -65,7 +66,7 @@ def write(
         columns = ["iteration", "frames", "seconds", "episode/count", "episode/normalised_return"]
         csv.writer(file).writerows([columns, *rows] if rows else [])
     if preset:
-        origin = {"commit": commit, "choices": {"preset": preset}, "machine": MACHINE}
+        origin = {"commit": commit, "choices": {"preset": preset, "symmetry": symmetry}, "machine": MACHINE}
         (folder / "origin.json").write_text(json.dumps(origin))
     if score is not None:
         modes = {"deterministic": score, "stochastic": score - 0.1}

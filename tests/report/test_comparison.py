@@ -7,6 +7,8 @@ from torchrl_mcp.report.comparison import ablations, caveats, cells, methods, ov
 from torchrl_mcp.report.results import read_run
 from torchrl_mcp.report.sections import method_colours, row
 
+GATE_KEPT = ["primitives", "gating", "observation_normaliser"]
+
 
 def grouped(*folders):
     return cells([read_run(folder) for folder in folders])
@@ -54,6 +56,9 @@ def test_tasks_characters_stages_and_methods_are_apart_in_the_papers_order(write
         ({"mixer__name": "additive"}, ("mixer", "additive")),
         ({"exploration__name": "weights"}, ("exploration", "weights")),
         ({"transfer__freeze": ["observation_normaliser"]}, ("trained", "gate and primitives")),
+        ({"transfer__keep": GATE_KEPT}, ("gate", "kept")),
+        ({"symmetry": "augment"}, ("symmetry", "augment")),
+        ({"budget__pretrain": 6_000_000}, ("budget.pretrain", 6_000_000)),
         ({"pretrained": "builtin"}, ("pretrained", "builtin")),
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
@@ -201,6 +206,12 @@ def test_a_method_s_own_settings_are_standard_in_both_stages(write_mcp):
         write_mcp("c", pretrained="a"),
     )
     assert [cell.is_standard for cell in (transferred, eight, sixteen)] == [True, True, False]
+
+
+@pytest.mark.parametrize("settings", [{"transfer__keep": GATE_KEPT}, {"symmetry": "augment"}], ids=["gate", "symmetry"])
+def test_a_kept_gate_and_symmetry_are_variants_whatever_the_method_tells(write_mcp, settings):
+    usual, variant = grouped(write_mcp("a", score=0.2), write_mcp("b", score=0.8, **settings))
+    assert (usual.is_standard, variant.is_standard, variant.reported) == (True, False, None)
 
 
 def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):

@@ -119,6 +119,17 @@ def test_the_share_of_successes_stands_beside_our_bar(write_run, tmp_path):
     assert text.get_position()[0] > 0.3
 
 
+def test_a_setting_that_is_no_choice_is_not_picked_by_its_return(run_writers, tmp_path):
+    _, write_mcp = run_writers(tmp_path)
+    for seed in range(2):
+        write_mcp(f"usual{seed}", seed=seed, score=0.4, optimizer__lr=1e-4)
+        write_mcp(f"weights{seed}", seed=seed, score=0.5, optimizer__lr=1e-4, exploration__name="weights")
+    write_mcp("tuned", score=0.9, optimizer__lr=3e-4)
+    write_mcp("kept", score=0.9, transfer__keep=["primitives", "gating"])
+    (panel,) = drawn(tmp_path).axes
+    assert bars(panel)["MCP"]["ours"] == pytest.approx(0.5)
+
+
 def test_a_method_of_your_own_stands_below_the_papers(write_run, tmp_path):
     write_run("own", method="mine", method__title="Mine", score=0.5)
     (panel,) = drawn(tmp_path).axes

@@ -71,8 +71,11 @@ class Cell:
 
     @property
     def is_standard(self) -> bool:
-        """Whether the settings are the method's standard ones, so that the cell is no variant."""
-        standard = self.runs[0].standard
+        """Whether the settings are the method's standard ones, so that the cell is no variant.
+
+        Unless the method says otherwise, a new gate is standard, and no use of the character's symmetry.
+        """
+        standard = {"gate": None, "symmetry": None} | self.runs[0].standard
         if self.stage == "pretrain":
             standard.pop("trained", None)  # a choice of transfer: pre-training trains all parts
         return all(self.choices[name] == value for name, value in standard.items())
@@ -178,7 +181,7 @@ def choices(run: Run) -> dict[str, Any]:
     Settings that a method lacks are None.
     """
     settings = run.settings
-    transfers = run.stage == "transfer" and "primitives" in settings.get("transfer.keep", ())
+    kept = settings.get("transfer.keep", ()) if run.stage == "transfer" else ()
     trained = "gate" if "primitives" in settings.get("transfer.freeze", ()) else "gate and primitives"
     named = {
         "preset": run.preset,
@@ -186,11 +189,14 @@ def choices(run: Run) -> dict[str, Any]:
         "num_primitives": settings.get("num_primitives"),
         "num_options": settings.get("num_options"),
         "latent_dim": settings.get("latent_dim"),
-        "trained": trained if transfers else None,
+        "trained": trained if "primitives" in kept else None,
+        "gate": "kept" if "gating" in kept else None,
         "mixer": settings.get("mixer.name"),
         "exploration": settings.get("exploration.name") if _explores(run) else None,
         "curriculum": run.curriculum_name if run.stage == "transfer" else None,
+        "symmetry": run.symmetry,
         "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
+        "budget.pretrain": settings.get("budget.pretrain") if kept else None,
     }
     return named | {name: settings.get(name) for name in run.standard if name not in named}
 

@@ -138,6 +138,12 @@ class Run:
         return self.settings.get("curriculum.name", self.settings.get("practice.name"))
 
     @property
+    def symmetry(self) -> str | None:
+        """Choice of the group ``symmetry``, None for ``none`` or if not recorded."""
+        choice = self.provenance.get("choices", {}).get("symmetry")
+        return None if choice == "none" else choice
+
+    @property
     def curriculum(self) -> list[str]:
         """Settings of the environment that differ between transfer and evaluation, as one line or none."""
         if self.stage != "transfer":

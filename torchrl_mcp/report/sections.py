@@ -40,9 +40,11 @@ SETTING_WORDS = {
     "num_options": "{} options",
     "latent_dim": "{} latent variables",
     "trained": "trained: {}",
+    "gate": "{} gate",
     "mixer": "{} mixer",
     "exploration": "exploration: {}",
     "curriculum": "curriculum: {}",
+    "symmetry": "symmetry: {}",
     "pretrained": "{} pre-training",
 }
 

@@ -25,8 +25,8 @@ def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
     """Return the cell that stands for each method in a row of Table 2.
 
     Scratch stands with its longest runs, which may have the steps of both stages. The others stand with as many steps
-    as the shortest of their runs. Of several cells of a method, such as two kinds of exploration, the one with the
-    highest deterministic return stands for it.
+    as the shortest of their runs. Of several :func:`.choices` of a method, such as two kinds of exploration, the one
+    with the highest deterministic return stands for it; of cells with the same choices, that with the most seeds.
 
     Args:
         cells: Cells of any task and stage.
@@ -35,10 +35,14 @@ def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
     here = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
     longest = max((cell.steps for cell in here if cell.method == "scratch"), default=0)
     shortest = min((cell.steps for cell in here if cell.method != "scratch"), default=0)
-    best: dict[str, Cell] = {}
+    most: dict[str, Cell] = {}
     for cell in here:
         if cell.steps == (longest if cell.method == "scratch" else shortest):
-            best[cell.method] = max(best.get(cell.method, cell), cell, key=average)
+            chosen = repr((cell.method, cell.choices))
+            most[chosen] = max(most.get(chosen, cell), cell, key=lambda cell: len(cell.by_seed))
+    best: dict[str, Cell] = {}
+    for cell in most.values():
+        best[cell.method] = max(best.get(cell.method, cell), cell, key=average)
     return best
 
 
