@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from torchrl_mcp.report.comparison import ablations, caveats, cells, methods, over_tasks
+from torchrl_mcp.report.comparison import ablations, caveats, cells, methods
 from torchrl_mcp.report.results import read_run
 from torchrl_mcp.report.sections import method_colours, row
 
@@ -308,30 +308,6 @@ def test_training_the_primitives_as_well_is_an_ablation_of_transfer_alone(write_
         ("transfer", "gate"),
         ("transfer", "gate and primitives"),
     ]
-
-
-def test_methods_are_compared_over_the_tasks_that_all_of_them_did(write_run, write_mcp):
-    found = grouped(
-        *(
-            write_run(f"s{t}{i}", task=t, seed=i, score=0.1 * i)
-            for t in ("heading", "carry", "dribble")
-            for i in (1, 2)
-        ),
-        *(write_mcp(f"m{t}{i}", task=t, seed=i, score=0.2 * i) for t in ("heading", "carry") for i in (1, 2)),
-        write_mcp("unfinished", task="dribble", progress=0.5),
-        write_mcp("variant", task="dribble", num_primitives=4, score=0.9),
-    )
-    places, estimates = over_tasks(found)
-    assert places == [("heading", "biped"), ("carry", "biped")]
-    assert {method: estimate.value for method, estimate in estimates.items()} == pytest.approx(
-        {"scratch": 0.15, "mcp": 0.3}
-    )
-
-
-def test_a_single_method_or_task_is_no_comparison(write_run, write_mcp):
-    alone = [write_run(task, task=task, score=0.5) for task in ("heading", "carry")]
-    assert over_tasks(grouped(*alone)) == ([], {})
-    assert over_tasks(grouped(alone[0], write_mcp("mcp", score=0.5))) == ([], {})
 
 
 @pytest.mark.parametrize(("seeds", "name"), [(1, ""), (2, "range "), (3, "range "), (4, "")])

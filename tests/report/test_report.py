@@ -70,6 +70,12 @@ def test_methods_are_compared_over_all_tasks(page):
     assert [row[:2] for row in rows(table)[1:]] == [["Scratch", "0.350"], ["MCP", "0.175"]]
 
 
+def test_a_single_method_or_task_is_no_comparison(write_run, write_mcp):
+    alone = [write_run(task, task=task, score=0.5) for task in ("heading", "carry")]
+    for folders in (alone, [alone[0], write_mcp("mcp", score=0.5)]):
+        assert not any("Over all tasks" in page for page in report(*find_runs(folders), moment=MOMENT).values())
+
+
 def test_an_ablation_compares_its_settings(page):
     (table,) = section(page, "ablations").all("table")
     assert [row[:2] for row in rows(table)] == [

@@ -15,7 +15,7 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
-from torchrl_mcp.report.table_2 import describe, draw_over_rows, draw_table_2
+from torchrl_mcp.report.table_2 import describe, draw_over_rows, draw_table_2, over_rows
 
 PUBLISHED = Path(__file__).parents[2] / "benchmarks/results/table2"
 ROWS = [
@@ -75,6 +75,7 @@ def test_the_published_runs_make_table_2(published, tmp_path):
         assert cell == f"{best:.3f}{share} ({len(seeds)})"
     page = report(runs, [], moment=datetime.now(UTC))["report.md"]
     assert all(re.match(r"[\d.]+", cell)[0] in page for cell in shown.values())
+    assert "## Over all tasks" in page
     save_figure(draw_table_2(cells(runs)), tmp_path / "table_2")
     assert (tmp_path / "table_2.svg").read_text() == (PUBLISHED / "table_2.svg").read_text()
 
@@ -158,6 +159,23 @@ def test_methods_are_compared_over_the_rows_that_they_share(run_writers, tmp_pat
     )
     assert [label.get_text() for label in right.get_yticklabels()] == ["Scratch"]
     assert right.lines[1].get_xdata() == pytest.approx([(3 / 4 + 1) / 2])
+
+
+def test_means_are_over_the_rows_of_all_methods_each_with_the_cell_that_stands_for_it(run_writers, tmp_path):
+    write_run, write_mcp = run_writers(tmp_path)
+    for seed in (1, 2):
+        for task in ("heading", "carry", "dribble"):
+            write_run(f"scratch-{task}{seed}", task=task, seed=seed, score=0.1 * seed, total_frames=2000)
+            write_run(f"short-{task}{seed}", task=task, seed=seed, score=0.05)
+        for task in ("heading", "carry"):
+            write_mcp(f"mcp-{task}{seed}", task=task, seed=seed, score=0.2 * seed)
+    write_mcp("unfinished", task="dribble", progress=0.5)
+    write_mcp("variant", task="dribble", num_primitives=4, score=0.9)
+    places, estimates = over_rows(cells(find_runs([tmp_path])[0]))
+    assert places == [("heading", "biped"), ("carry", "biped")]
+    assert {method: estimate.value for method, estimate in estimates.items()} == pytest.approx(
+        {"scratch": 0.15, "mcp": 0.3}
+    )
 
 
 def test_without_another_method_nothing_is_compared(run_writers, tmp_path):

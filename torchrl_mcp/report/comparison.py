@@ -9,7 +9,7 @@ from functools import cached_property
 from statistics import fmean
 from typing import Any, TypeVar
 
-from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, shared_means
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, mean, shared_means
 from torchrl_mcp.report.paper import METHODS, PLACES, TABLE_2, Reported
 from torchrl_mcp.report.results import Run
 from torchrl_mcp.runs.identity import PRETRAINING, UNLEARNT, is_among
@@ -250,23 +250,6 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
             if len(totals) > 1
         ),
     ]
-
-
-def over_tasks(cells: Iterable[Cell]) -> tuple[list[tuple[str, str]], dict[str, Estimate]]:
-    """Return the tasks of Table 2 in which all methods were evaluated, and each method's interquartile mean over them.
-
-    A method with several cells in a task counts as not evaluated there. Both are empty for fewer than two methods or
-    tasks.
-    """
-    scores: dict[str, dict[tuple[str, str], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
-    for cell in cells:
-        if cell.stage == "transfer" and cell.is_standard and cell.complete:
-            scores[cell.method][cell.place].append(cell.returns())
-    single = {m: {p: r[0] for p, r in places.items() if len(r) == 1} for m, places in scores.items()}
-    shared = [place for place in PLACES if all(place in places for places in single.values())]
-    if len(single) < 2 or len(shared) < 2:
-        return [], {}
-    return shared, {method: interquartile_mean([places[p] for p in shared]) for method, places in single.items()}
 
 
 def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:

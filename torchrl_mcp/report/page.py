@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_mcp import __version__
-from torchrl_mcp.report.comparison import Cell, cells, methods, over_tasks
+from torchrl_mcp.report.comparison import Cell, cells, methods
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.report.results import MODES, STATES, Damaged, Run
 from torchrl_mcp.report.sections import (
@@ -24,7 +24,7 @@ from torchrl_mcp.report.sections import (
     task_sections,
 )
 from torchrl_mcp.report.svg import inline_svg
-from torchrl_mcp.report.table_2 import describe, draw_table_2
+from torchrl_mcp.report.table_2 import describe, draw_table_2, over_rows
 from torchrl_mcp.training import precision
 
 PAGES = ("report.html", "report.md")
@@ -59,7 +59,7 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
     stages = {stage: [cell for cell in found if cell.stage == stage] for stage in ("transfer", "pretrain")}
     names = (f"plot-{number}" for number in count(1))
     machines = list(dict.fromkeys(map(_machine, runs)))
-    shared, aggregate = over_tasks(found)
+    shared, aggregate = over_rows(found)
     palette = method_colours(found)
     context = {
         "runs": [run for cell in found for run in cell.runs],
@@ -69,7 +69,7 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
         "picture": _picture(found),
         "titles": methods(found),
         "shared": shared,
-        "aggregate": aggregate,
+        "aggregate": aggregate if min(len(shared), len(aggregate)) > 1 else {},
         "transfer": task_sections(stages["transfer"], names, palette),
         "ablations": ablation_chapters(found, names),
         "diagnostics": diagnostic_tables(found),

@@ -102,11 +102,20 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
     bare(axes)
 
 
+def over_rows(cells: Sequence[Cell]) -> tuple[list[Place], dict[str, Estimate]]:
+    """Return the rows of Table 2 in which every method was run, and each method's interquartile mean over them."""
+    rows = {place: found for place in PLACES if (found := compared(cells, place))}
+    named = methods(cell for found in rows.values() for cell in found.values())
+    shared = [place for place, found in rows.items() if found.keys() == named.keys()]
+    returns = {name: [rows[place][name].returns() for place in shared] for name in named if shared}
+    return shared, {name: interquartile_mean(strata) for name, strata in returns.items()}
+
+
 def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
     """Draw each method's interquartile mean, and how probable it is that a run of MCP is ahead of one of the method.
 
-    Means are over the rows in which every method was run, the probability is over those that both have. Lines are 95 %
-    bootstrap intervals, where every row has two seeds or more.
+    Means are those of :func:`over_rows`, the probability is over the rows that both have. Lines are 95 % bootstrap
+    intervals, where every row has two seeds or more.
 
     Args:
         cells: Cells of any task and stage.
@@ -118,9 +127,8 @@ def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
     if not rows:
         return None
     named = methods(cell for found in rows for cell in found.values())
-    shared = [found for found in rows if found.keys() == named.keys()]
     others = [method for method in named if method != "mcp"]
-    means = {name: interquartile_mean([found[name].returns() for found in shared]) for name in named if shared}
+    shared, means = over_rows(cells)
     ahead = {
         name: probability_of_improvement([(f["mcp"].returns(), f[name].returns()) for f in rows if name in f])
         for name in others
