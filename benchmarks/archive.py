@@ -68,7 +68,7 @@ def pack(root: Path, archive: Path) -> None:
             contents = {name: (run.path / name).read_text() for name in (CONFIG, EVALUATION, PROVENANCE)}
             contents[METRICS] = curve(run.path / METRICS)
             for name, content in contents.items():
-                data = content.replace(str(root.resolve()), "runs").replace(str(root), "runs").encode()
+                data = content.replace(str(root.resolve()), "runs").replace(str(root.absolute()), "runs").encode()
                 entry = tarfile.TarInfo(f"{run.path.resolve().relative_to(root.resolve())}/{name}")
                 entry.size = len(data)
                 packed.addfile(entry, io.BytesIO(data))

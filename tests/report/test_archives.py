@@ -160,6 +160,16 @@ def test_the_archive_gives_the_same_results_again(results, tmp_path, monkeypatch
     assert not any(str(tmp_path) in path.read_text() for path in kept.rglob("*.*"))
 
 
+def test_the_name_of_the_folder_of_runs_may_occur_in_their_files(tmp_path, run_writers, monkeypatch):
+    write, _ = run_writers(tmp_path)
+    run = write("run", score=0.5)
+    monkeypatch.chdir(tmp_path)
+    tabulate(monkeypatch, ".", "--output", "results")
+    kept = unpack(tmp_path / "results/runs.tar.xz", tmp_path / "kept")
+    assert (kept / "run/evaluation.json").read_text() == (run / "evaluation.json").read_text()
+    assert "run_dir: runs/run\n" in (kept / "run/config.yaml").read_text()
+
+
 def test_without_runs_and_archive_the_script_says_what_it_needs(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         tabulate(monkeypatch, "--output", tmp_path)
