@@ -55,6 +55,16 @@ def test_the_return_is_that_of_the_evaluation_once_there_is_one(runs):
     assert status(runs / "finished").remaining is None
 
 
+@pytest.mark.parametrize("blank", ["nan", ""])
+def test_without_an_episode_that_ended_a_run_has_no_return(tmp_path, blank):
+    run = make_run(tmp_path / "run", frames=400)
+    metrics = run / "metrics.csv"
+    metrics.write_text(metrics.read_text().replace("0.25", blank))
+    one = status(run)
+    assert (one.state, one.normalised_return) == ("stopped", None)
+    assert shown(tmp_path).splitlines()[1].split()[4] == "-"
+
+
 def test_a_run_is_done_after_its_steps_unless_an_evaluation_is_to_follow(tmp_path):
     assert status(make_run(tmp_path / "old", frames=1000, saved=1000, log=False)).state == "done"
     assert status(make_run(tmp_path / "none", frames=1000, saved=1000, episodes=0)).state == "done"

@@ -4,6 +4,7 @@ It is read from the run folders, so any process on any machine that shares them 
 """
 
 import csv
+import math
 import os
 import sys
 import threading
@@ -50,7 +51,7 @@ class Status:
         frames: Environment steps so far.
         total: Environment steps of the whole run.
         speed: Environment steps per second in the last iteration.
-        normalised_return: Normalised return of the evaluation, else of training; None if there is neither.
+        normalised_return: Normalised return of the evaluation, else of training's last row; None if neither has one.
     """
 
     folder: Path
@@ -125,7 +126,8 @@ def status(run: Path, total: int | None = None) -> Status:
     total = _plan(run)[0] if total is None else total
     last = _last_row(run / METRICS)
     frames = int(last.get("frames", 0))
-    speed, score = last.get("time/steps_per_second", 0.0), last.get(NORMALISED_RETURN)
+    speed, last_return = last.get("time/steps_per_second", 0.0), last.get(NORMALISED_RETURN, math.nan)
+    score = None if math.isnan(last_return) else last_return
     if (run / EVALUATION).exists():
         score = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
         return Status(run, "done", frames, total, speed, score)
@@ -210,4 +212,4 @@ def _last_row(path: Path) -> dict[str, float]:
     if not whole:
         return {}
     row = next(csv.DictReader([names, whole[-1]]))
-    return {name: float(value) for name, value in row.items()}
+    return {name: float(value or "nan") for name, value in row.items()}

@@ -19,7 +19,7 @@ METRICS = "metrics.csv"
 """A row of metrics per iteration."""
 
 NORMALISED_RETURN = "episode/normalised_return"
-"""The column of metrics with the mean of the episodes that ended, blank before any can have its full length."""
+"""The column of metrics with the mean of the episodes that ended; ``nan`` if none did, or none can be whole yet."""
 
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""
