@@ -30,13 +30,46 @@ def fill(folder, iterations):
     return writer
 
 
-def test_every_row_has_the_names_of_the_first(tmp_path):
+def test_every_row_has_the_columns_of_all_others(tmp_path):
     writer = MetricsWriter(tmp_path)
     writer.write({"iteration": 1, "loss": 0.1}, step=100)
     writer.write({"loss": math.nan, "iteration": 2}, step=200)
     assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,loss", "1,0.1", "2,nan"]
-    with pytest.raises(ValueError, match="surprise"):
-        writer.write({"iteration": 3, "loss": 0.1, "surprise": 1.0}, step=300)
+    writer.write({"iteration": 3, "new": 1.0}, step=300)
+    writer.write({"iteration": 4, "loss": 0.2, "new": 2.0}, step=400)
+    lines = ["iteration,loss,new", "1,0.1,nan", "2,nan,nan", "3,nan,1.0", "4,0.2,2.0"]
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
+
+
+def test_a_run_goes_on_with_other_metrics_than_those_of_an_earlier_version(tmp_path):
+    fill(tmp_path, [1, 2])
+    writer = MetricsWriter(tmp_path)
+    writer.rewind(1)
+    writer.write({"iteration": 2, "frames": 200, "new": 0.5}, step=200)
+    first, second = read_metrics(tmp_path)
+    assert (first["loss"], second["new"]) == (1 / 3, 0.5)
+    assert math.isnan(first["new"])
+    assert math.isnan(second["loss"])
+
+
+def test_a_kill_while_columns_are_added_loses_no_row(tmp_path, monkeypatch):
+    writer = fill(tmp_path, [1, 2])
+    before = (tmp_path / "metrics.csv").read_bytes()
+
+    def killed(self, rows):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("csv.DictWriter.writerows", killed)
+    with pytest.raises(KeyboardInterrupt):
+        writer.write({"iteration": 3, "new": 1.0}, step=300)
+    assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("held", ["", "iteration,frames,loss\n"], ids=["nothing", "header"])
+def test_a_file_without_rows_gets_one_header(tmp_path, held):
+    (tmp_path / "metrics.csv").write_text(held)
+    fill(tmp_path, [1])
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,frames,loss", f"1,100,{1 / 3}"]
 
 
 def test_numbers_survive_the_file_to_the_bit(tmp_path):

@@ -1,7 +1,8 @@
 """The metrics of a run: one CSV file, and any of TorchRL's loggers."""
 
 import csv
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from torchrl.record.loggers.common import Logger
@@ -40,21 +41,17 @@ class MetricsWriter:
         self._columns: list[str] = []
 
     def write(self, metrics: Mapping[str, float], *, step: int) -> None:
-        """Append ``metrics``, with the same names in every call, at environment step ``step``.
+        """Append ``metrics`` at environment step ``step``; those that are new get a column, NaN in the rows so far.
 
         Raises:
             FileNotFoundError: If the file was removed since the last row.
         """
-        new = not self._columns
-        if new:
-            self._columns = list(metrics)
-        elif not self.path.exists():
+        if self._columns and not self.path.exists():
             raise FileNotFoundError(f"{self.path} was removed, with the rows written so far")
+        if metrics.keys() - self._columns:
+            self._rewrite(self._rows(), metrics)
         with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
-            if new:
-                writer.writeheader()
-            writer.writerow(dict(metrics))
+            csv.DictWriter(file, self._columns, restval=math.nan).writerow(dict(metrics))
         for logger in self.loggers:
             logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)
 
@@ -82,13 +79,17 @@ class MetricsWriter:
         if not self.path.exists():
             return
         # Without rows, even the header may be incomplete: the next row writes it again.
-        self._columns = list(kept[0]) if kept else []
-        with replacing(self.path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
-            if kept:
-                writer.writeheader()
-            writer.writerows(kept)
+        self._rewrite(kept)
         self._rewind_csv_logger(int(kept[-1]["frames"]) if kept else 0)
+
+    def _rewrite(self, rows: Sequence[Mapping[str, str]], names: Iterable[str] = ()) -> None:
+        """Replace the file by ``rows`` with columns for ``names`` as well, NaN where a row has none."""
+        self._columns = list(dict.fromkeys([*(rows[0] if rows else ()), *names]))
+        with replacing(self.path) as partial, partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self._columns, restval=math.nan)
+            if self._columns:
+                writer.writeheader()
+            writer.writerows(rows)
 
     def _rewind_csv_logger(self, frames: int) -> None:
         """Drop the lines that TorchRL's csv logger, which only appends, wrote after environment step ``frames``."""
