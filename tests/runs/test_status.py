@@ -1,6 +1,7 @@
 import io
 import json
 import sys
+import threading
 
 import pytest
 from rich.console import Console
@@ -102,6 +103,14 @@ def test_without_a_terminal_there_is_a_line_for_each_change(runs, capsys, monkey
         [["done", "later"], ["running", "alive"]],
     )
     assert lines[-1].endswith("(1 running, 1 done)")
+
+
+def test_a_block_that_fails_ends_the_lines(runs, monkeypatch):
+    monkeypatch.setattr("torchrl_mcp.runs.status.INTERVAL", 0.01)
+    before = threading.active_count()
+    with pytest.raises(KeyboardInterrupt), overview(runs):
+        raise KeyboardInterrupt
+    assert threading.active_count() == before
 
 
 def test_the_command_shows_a_folder(runs, capsys, monkeypatch):

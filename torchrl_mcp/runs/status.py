@@ -84,9 +84,11 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
     ended = threading.Event()
     thread = threading.Thread(target=_tell, args=(folder, runs, ended), daemon=True)
     thread.start()
-    yield
-    ended.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def look(folder: Path, runs: Runs | None = None) -> list[Status]:
