@@ -140,6 +140,13 @@ def test_pretraining_ignores_how_much_the_gate_of_transfer_explores(tmp_path):
     assert transfer.needs == source.folder
 
 
+@pytest.mark.parametrize("setting", ["goal_positions=metres,logarithmic", "waypoint=true,false"])
+def test_goals_of_the_task_of_transfer_share_a_pretraining(tmp_path, setting):
+    arguments = ["task=dribble", "character=biped", "method=mcp", "seed=0", setting]
+    jobs = jobs_of("benchmark=table2", f"run_root={tmp_path}", *arguments)
+    assert [job.config["stage"]["name"] for job in jobs] == ["pretrain", "transfer", "transfer"]
+
+
 def test_a_longer_transfer_shares_the_pretraining_of_a_shorter_one(tmp_path):
     def jobs(*budget):
         arguments = ["task=dribble", "character=biped", "method=mcp", "preset=comparison", "seed=0", *budget]

@@ -42,7 +42,10 @@ PRETRAINING = frozenset({"imitation", "motions"})
 """Settings of :data:`UNLEARNT` that a transfer learns from if it keeps networks: those of their pre-training."""
 
 TRANSFER_ONLY = frozenset(
-    {"budget.scratch", "budget.transfer", "exploration", "curriculum", "pretrained", "transfer.freeze", "transfer.keep"}
+    {
+        *("budget.scratch", "budget.transfer", "curriculum", "exploration", "goal_positions"),
+        *("pretrained", "transfer", "waypoint"),
+    }
 )
 """Settings that pre-training ignores or refuses."""
 
