@@ -125,7 +125,8 @@ def test_what_one_optimiser_trains_the_other_s_loss_does_not_read(built):
 
 
 def decays(trainer):
-    estimator = getattr(trainer.advantages, "gae", trainer.advantages)
+    gae = getattr(trainer.advantages, "gae", None)
+    estimator = gae.estimator if gae else trainer.advantages
     return float(estimator.lmbda), float(estimator.gamma)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Self
 
 import numpy as np
 import torch
@@ -154,7 +154,7 @@ class MotionClip:
         """Return the clip at another horizontal position and heading."""
         return replace(self, qpos=placement.qpos(self.qpos))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path | BinaryIO) -> None:
         """Write a NumPy archive (``.npz``) of plain arrays, bit for bit; reading it runs no code."""
         joints = np.array(self.layout.names)
         np.savez_compressed(

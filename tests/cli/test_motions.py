@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -41,6 +42,36 @@ def run(monkeypatch, capsys, tmp_path):
         return status, captured.out, captured.err
 
     return run
+
+
+def test_import_replaces_no_recording(run, tmp_path):
+    for name in ("walk.npz", "own/walk.npz"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        np.savez(tmp_path / name, note="the only copy")
+    (tmp_path / "walk.txt").write_text(motion(1.0))
+    (tmp_path / "clip.txt").write_text(motion(1.0))
+    assert run("import", "clip.txt")[0] == 0
+    assert run("import", "clip.txt")[0] == 0  # again
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
+    for words in (["walk.txt"], ["walk.txt", "--output", "own"], ["clip.npz"]):
+        status, _, errors = run("import", *words)
+        assert "is a recording that the clip would replace: give another --output" in f"{status}{errors}"
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.npz")} == before
+
+
+def test_a_clip_that_cannot_be_written_leaves_the_one_before(run, tmp_path, monkeypatch):
+    (tmp_path / "walk.txt").write_text(motion(1.0))
+    run("import", "walk.txt")
+    before = (tmp_path / "walk.npz").read_bytes()
+
+    def full(clip, file):
+        file.write(b"half")
+        raise OSError("no space left on the device")
+
+    monkeypatch.setattr(MotionClip, "save", full)
+    assert run("import", "walk.txt")[0] != 0
+    assert [path.name for path in tmp_path.glob("*.npz*")] == ["walk.npz"]
+    assert (tmp_path / "walk.npz").read_bytes() == before
 
 
 def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):

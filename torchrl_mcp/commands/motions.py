@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_fil
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
 from torchrl_mcp.envs.motions.inspection.summary import Summary, summarised
 from torchrl_mcp.runs.tables import text_table
+from torchrl_mcp.training.run_folder import replacing
 
 PAPER_CORPUS = {
     "humanoid3d_long_walk1.txt": 32.79,
@@ -69,6 +70,7 @@ SLIDING = 0.2
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file, and its mirror image if requested."""
     motions = _load(arguments)
+    _require_free(arguments.files, arguments.output)
     if arguments.mirror:
         motions |= {
             f"{name}_mirrored": motion._replace(clip=motion.clip.mirrored()) for name, motion in motions.items()
@@ -142,10 +144,22 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
 
 def _save(motions: Mapping[str, Import], folder: Path) -> None:
     """Write clips into a folder, and print a table about them."""
-    folder.mkdir(parents=True, exist_ok=True)
     for name, (clip, *_) in motions.items():
-        clip.save(folder / f"{name}.npz")
+        with replacing(folder / f"{name}.npz") as partial, partial.open("wb") as file:
+            clip.save(file)
     print(f"{_table(motions)}\nwritten to {folder}")
+
+
+def _require_free(recordings: Iterable[Path], folder: Path) -> None:
+    """Check that the clips of recordings replace nothing in a folder but clips.
+
+    Raises:
+        ValueError: If one would replace a recording.
+    """
+    for path in recordings:
+        clip = folder / f"{path.stem}.npz"
+        if clip.exists() and (clip.samefile(path) or "character" not in Archive(clip).names):
+            raise ValueError(f"{clip} is a recording that the clip would replace: give another --output")
 
 
 def _table(motions: Mapping[str, Import]) -> str:

@@ -16,6 +16,7 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build, configuration, policies
 from torchrl_mcp.runs.build import Agent
 from torchrl_mcp.runs.builtin import locate
+from torchrl_mcp.runs.quoting import quoted
 from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.watch import Watch
@@ -83,7 +84,7 @@ def _restored(arguments: argparse.Namespace) -> tuple[Agent, CharacterEnv]:
 
 def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv]:
     """Return an untrained policy, and the environment of a configuration."""
-    own = [f"hydra.searchpath=[file://{arguments.config_dir.resolve()}]"] if arguments.config_dir else []
+    own = [f"hydra.searchpath=[{quoted(f'file://{arguments.config_dir.resolve()}')}]"] if arguments.config_dir else []
     try:
         cfg = configuration.compose_run(*own, *arguments.settings)
         if cfg.stage.name not in cfg.task:
