@@ -45,7 +45,7 @@ def run(monkeypatch, capsys, tmp_path):
 
 
 def test_import_replaces_no_recording(run, tmp_path):
-    for name in ("walk.npz", "own/walk.npz"):
+    for name in ("walk.npz", "own/walk.npz", "clip_mirrored.npz"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         np.savez(tmp_path / name, note="the only copy")
     (tmp_path / "walk.txt").write_text(motion(1.0))
@@ -53,7 +53,7 @@ def test_import_replaces_no_recording(run, tmp_path):
     assert run("import", "clip.txt")[0] == 0
     assert run("import", "clip.txt")[0] == 0  # again
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
-    for words in (["walk.txt"], ["walk.txt", "--output", "own"], ["clip.npz"]):
+    for words in (["walk.txt"], ["walk.txt", "--output", "own"], ["clip.npz"], ["clip.txt", "--mirror"]):
         status, _, errors = run("import", *words)
         assert "is a recording that the clip would replace: give another --output" in f"{status}{errors}"
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.npz")} == before

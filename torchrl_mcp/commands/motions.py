@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -70,12 +70,11 @@ SLIDING = 0.2
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file, and its mirror image if requested."""
     motions = _load(arguments)
-    _require_free(arguments.files, arguments.output)
     if arguments.mirror:
         motions |= {
             f"{name}_mirrored": motion._replace(clip=motion.clip.mirrored()) for name, motion in motions.items()
         }
-    _save(motions, arguments.output)
+    _save(motions, arguments.output, arguments.files)
 
 
 def inspect_files(arguments: argparse.Namespace) -> None:
@@ -142,24 +141,20 @@ def _load(arguments: argparse.Namespace) -> dict[str, Import]:
     return motions
 
 
-def _save(motions: Mapping[str, Import], folder: Path) -> None:
-    """Write clips into a folder, and print a table about them."""
-    for name, (clip, *_) in motions.items():
-        with replacing(folder / f"{name}.npz") as partial, partial.open("wb") as file:
-            clip.save(file)
-    print(f"{_table(motions)}\nwritten to {folder}")
-
-
-def _require_free(recordings: Iterable[Path], folder: Path) -> None:
-    """Check that the clips of recordings replace nothing in a folder but clips.
+def _save(motions: Mapping[str, Import], folder: Path, recordings: Sequence[Path] = ()) -> None:
+    """Write clips into a folder, and print a table about them.
 
     Raises:
-        ValueError: If one would replace a recording.
+        ValueError: If one would replace a recording: one of ``recordings``, or a file that is no clip.
     """
-    for path in recordings:
-        clip = folder / f"{path.stem}.npz"
-        if clip.exists() and (clip.samefile(path) or "character" not in Archive(clip).names):
-            raise ValueError(f"{clip} is a recording that the clip would replace: give another --output")
+    paths = {name: folder / f"{name}.npz" for name in motions}
+    for path in filter(Path.exists, paths.values()):
+        if any(map(path.samefile, recordings)) or "character" not in Archive(path).names:
+            raise ValueError(f"{path} is a recording that the clip would replace: give another --output")
+    for name, (clip, *_) in motions.items():
+        with replacing(paths[name]) as partial, partial.open("wb") as file:
+            clip.save(file)
+    print(f"{_table(motions)}\nwritten to {folder}")
 
 
 def _table(motions: Mapping[str, Import]) -> str:
