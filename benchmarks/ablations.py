@@ -1,7 +1,7 @@
 """Table 4, Figure 8, and MCP with other mixers and other exploration: the runs, archived, with their tables and curves.
 
+    # likewise benchmark=mixer, exploration and freeze, and task=heading
     torchrl-mcp-train benchmark=num_primitives preset=comparison character=biped run_root=runs/ablations
-    ... # likewise mixer, exploration and freeze, and task=heading
     python benchmarks/ablations.py runs/ablations    # archives the complete runs, and writes the results
     python benchmarks/ablations.py                   # writes the results again, from the archive
 

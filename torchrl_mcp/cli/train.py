@@ -34,7 +34,7 @@ SETTINGS = {
     "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to make it longer",
     "training.total_frames=N": "environment steps",
     "width=FACTOR": "on the paper's hidden layers",
-    "device=cuda": "networks on a GPU; physics stays on the CPU without physics=warp",
+    "device=cuda": "networks on a GPU; the physics only with physics=warp",
 }
 
 EXAMPLES = f"""\
