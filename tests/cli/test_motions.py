@@ -74,6 +74,30 @@ def test_a_clip_that_cannot_be_written_leaves_the_one_before(run, tmp_path, monk
     assert (tmp_path / "walk.npz").read_bytes() == before
 
 
+def test_a_file_that_cannot_be_read_keeps_no_other_from_being_written(run, tmp_path):
+    for name in ("first", "last"):
+        (tmp_path / f"{name}.txt").write_text(motion(1.0))
+    (tmp_path / "cut.txt").write_text(motion(1.0)[:100])
+    (tmp_path / "empty.bvh").write_text("")
+    status, output, errors = run("import", "first.txt", "cut.txt", "empty.bvh", "last.txt", "--output", "clips")
+    assert status == 2
+    assert {path.name for path in (tmp_path / "clips").iterdir()} == {"first.npz", "last.npz"}
+    assert [line.split()[0] for line in output.splitlines()[1:4]] == ["first", "last", "total"]
+    first, *others = errors.splitlines()
+    assert first == "torchrl-mcp-motions: 2 files were left out:"
+    assert ["cut.txt" in others[0], "empty.bvh" in others[1]] == [True, True]
+    status, output, errors = run("inspect", "cut.txt", "last.txt")
+    assert (status, output.splitlines()[1].split()[0]) == (2, "last")
+    assert errors.startswith("torchrl-mcp-motions: cut.txt")
+
+
+def test_an_argument_that_is_wrong_for_all_files_is_named_once(run, tmp_path):
+    for name in ("first", "last"):
+        (tmp_path / f"{name}.txt").write_text(motion(1.0))
+    status, output, errors = run("import", "first.txt", "last.txt", "--character", "lizard")
+    assert (status, output, errors.count("lizard"), len(errors.splitlines())) == (2, "", 1, 1)
+
+
 def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     (tmp_path / "walk.txt").write_text(motion(2.0, speed=0.5))
     (tmp_path / "stroll.json").write_text(motion(1.0, speed=0.3))
@@ -88,8 +112,8 @@ def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     measured += ["0.0", "deg", "0.0", "cm", "0.0", "cm"]
     assert lines[1].split()[:-2] == measured
     assert lines[1].split()[-1] == "-"  # joints of the character itself have no rest pose
-    assert lines[2].split()[4] == "0.30"
-    assert [line.split()[0] for line in lines[2:5]] == ["stroll", "walk_mirrored", "stroll_mirrored"]
+    assert lines[3].split()[4] == "0.30"
+    assert [line.split()[0] for line in lines[2:5]] == ["walk_mirrored", "stroll", "stroll_mirrored"]
     assert lines[5].split() == ["total", "6.0"]
     assert lines[6] == "written to clips"
 
@@ -257,7 +281,7 @@ WRONG = {
     "missing clip": (["inspect", "nowhere.npz"], "torchrl-mcp-motions: .*nowhere.npz"),
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
     "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
-    "no BVH": (["import", "broken.bvh"], r"broken\.bvh:1: does not begin with HIERARCHY"),
+    "no BVH": (["import", "cut.bvh"], r"cut\.bvh:1: does not begin with HIERARCHY"),
     "needless bodies": (
         ["import", "stand.txt", "--bodies", "bodies.yaml"],
         "bodies do not apply to character=humanoid",
@@ -270,7 +294,7 @@ WRONG = {
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: give it \(--fps\)"),
-    "wrong map": (["import", "broken.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
+    "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
     "same name": (["inspect", "stand.txt", "more/stand.txt"], "two files are called stand"),
@@ -280,7 +304,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("words", "message"), WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message):
-    (tmp_path / "broken.bvh").write_text("nothing")
+    (tmp_path / "cut.bvh").write_text("nothing")
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
     (tmp_path / "notes.md").write_text("nothing")
     (tmp_path / "bodies.yaml").write_text("chest: chest")

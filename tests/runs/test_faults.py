@@ -71,6 +71,23 @@ def test_a_run_that_is_at_work_is_shown_as_running_and_nobody_joins_in(killed, t
     assert contents(killed) == before
 
 
+def test_a_resume_that_fails_leaves_the_run_as_it_was(whole):
+    before = contents(whole)
+    with pytest.raises(ValueError, match="torch does not know device=mars"):
+        experiment.resume(whole, total_frames=99_999, device="mars")
+    assert contents(whole) == before
+    assert status(whole).state == "done"
+
+
+def test_a_run_that_was_stopped_can_end_where_it_is(killed, whole):
+    experiment.resume(killed, total_frames=512)
+    assert rows(killed) == rows(whole)[:4]
+    shown = status(killed)
+    assert (shown.state, shown.frames, shown.total) == ("done", 512, 512)
+    (entry,) = json.loads((killed / "origin.json").read_text())["extended"]
+    assert (entry["planned"], entry["total_frames"], entry["after"]) == (640, 512, 512)
+
+
 def test_a_run_holds_its_folder_from_before_the_first_file_to_after_the_last(tmp_path, monkeypatch):
     def seen(function):
         def wrapper(*arguments, **settings):

@@ -31,7 +31,7 @@ SETTINGS = {
     "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
     "seed=N": "seed of networks, environments and sampling",
     "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
-    "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to make it longer",
+    "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to change its length",
     "training.total_frames=N": "environment steps",
     "width=FACTOR": "on the paper's hidden layers",
     "device=cuda": "networks on a GPU; the physics only with physics=warp",

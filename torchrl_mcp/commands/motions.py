@@ -2,8 +2,9 @@
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from zipfile import BadZipFile
 
 from torch import Tensor
 
@@ -11,6 +12,7 @@ from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.importer import Import, imported
 from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
 from torchrl_mcp.envs.motions.capture.key_bodies import read_key_map
+from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
 from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
@@ -63,36 +65,55 @@ STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
 }
 """Columns of the table of strides, which shows medians."""
 
+MIRRORED = "_mirrored"
+"""End of the names of mirror images."""
+
+Failures = dict[Path, Exception]
+"""Errors by the files that could not be read."""
+
 SLIDING = 0.2
 """Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
 
 
 def import_files(arguments: argparse.Namespace) -> None:
-    """Write a clip for each file, and its mirror image if requested."""
-    motions = _load(arguments)
-    if arguments.mirror:
-        motions |= {
-            f"{name}_mirrored": motion._replace(clip=motion.clip.mirrored()) for name, motion in motions.items()
-        }
-    _save(motions, arguments.output, arguments.files)
+    """Write a clip for each file as soon as it is read, and its mirror image if requested."""
+    names = [path.stem for path in arguments.files]
+    names += [f"{name}{MIRRORED}" for name in names if arguments.mirror]
+    _require_no_recordings(names, arguments.output, arguments.files)
+    written: dict[str, Import] = {}
+    failed: Failures = {}
+    for name, motion in _read(arguments, failed):
+        made = {name: motion}
+        if arguments.mirror:
+            made[f"{name}{MIRRORED}"] = motion._replace(clip=motion.clip.mirrored())
+        _save(made, arguments.output)
+        written |= made
+    if written:
+        print(f"{_table(written)}\nwritten to {arguments.output}")
+    _raise(failed)
 
 
 def inspect_files(arguments: argparse.Namespace) -> None:
     """Print tables about motions."""
-    motions = _load(arguments)
-    print(_table(motions))
-    if arguments.strides:
-        print(f"\n{_strides(motions)}")
+    failed: Failures = {}
+    motions = dict(_read(arguments, failed))
+    if motions:
+        print(_table(motions))
+        if arguments.strides:
+            print(f"\n{_strides(motions)}")
+    _raise(failed)
 
 
 def render_files(arguments: argparse.Namespace) -> None:
     """Draw a contact sheet and a film of each motion."""
     arguments.output.mkdir(parents=True, exist_ok=True)
-    for name, (clip, *_) in _load(arguments).items():
+    failed: Failures = {}
+    for name, (clip, *_) in _read(arguments, failed):
         sheet, film = arguments.output / f"{name}.png", arguments.output / f"{name}.gif"
         save_picture(contact_sheet(clip), sheet)
         save_film(clip, film, seconds=arguments.seconds)
         print(f"{sheet}\n{film}")
+    _raise(failed)
 
 
 def build_paper_corpus(arguments: argparse.Namespace) -> None:
@@ -110,51 +131,74 @@ def build_paper_corpus(arguments: argparse.Namespace) -> None:
             raise ValueError(f"{expected}: it is another file, or was changed; download it again")
         motions[path.stem] = motion
         if not clip.loop:
-            motions[f"{path.stem}_mirrored"] = motion._replace(clip=clip.mirrored())
+            motions[f"{path.stem}{MIRRORED}"] = motion._replace(clip=clip.mirrored())
+    _require_no_recordings(motions, arguments.output)
     _save(motions, arguments.output)
+    print(f"{_table(motions)}\nwritten to {arguments.output}")
 
 
-def _load(arguments: argparse.Namespace) -> dict[str, Import]:
-    """Read the files, by their names without suffix."""
-    motions: dict[str, Import] = {}
+def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str, Import]]:
+    """Yield the motion of each file, with its name without suffix, and put errors of the others into ``failed``."""
     for path in arguments.files:
-        if path.stem in motions:
+        if sum(path.stem == other.stem for other in arguments.files) > 1:
             raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
-        saved = path.suffix == ".npz" and "character" in Archive(path).names
-        own = str(Archive(path).array("character")) if saved else HUMANS[0]
-        motions[path.stem] = imported(
-            path,
-            arguments.character or own,
-            rate=arguments.rate,
-            fps=arguments.fps,
-            scale=arguments.scale,
-            joint_map=_joint_map(arguments.map),
-            skip=arguments.skip,
-            rest_frame=arguments.rest_frame,
-            up=arguments.up,
-            asf=arguments.asf,
-            body_model=arguments.body_model,
-            quaternion=arguments.quaternion,
-            joints=arguments.joints.split(",") if arguments.joints else None,
-            bodies=read_key_map(arguments.bodies) if arguments.bodies else None,
-        )
-    return motions
+    joint_map = _joint_map(arguments.map)
+    bodies = read_key_map(arguments.bodies) if arguments.bodies else None
+    for path in arguments.files:
+        try:
+            own = str(Archive(path).array("character")) if path.suffix == ".npz" and _is_clip(path) else HUMANS[0]
+            motion = imported(
+                path,
+                arguments.character or own,
+                rate=arguments.rate,
+                fps=arguments.fps,
+                scale=arguments.scale,
+                joint_map=joint_map,
+                skip=arguments.skip,
+                rest_frame=arguments.rest_frame,
+                up=arguments.up,
+                asf=arguments.asf,
+                body_model=arguments.body_model,
+                quaternion=arguments.quaternion,
+                joints=arguments.joints.split(",") if arguments.joints else None,
+                bodies=bodies,
+            )
+        except (BadZipFile, OSError, RuntimeError, ValueError) as error:
+            failed[path] = error
+        else:
+            yield path.stem, motion
 
 
-def _save(motions: Mapping[str, Import], folder: Path, recordings: Sequence[Path] = ()) -> None:
-    """Write clips into a folder, and print a table about them.
+def _raise(failed: Failures) -> None:
+    """Raise an error with those of all files, if there are any."""
+    if messages := list(dict.fromkeys(map(str, failed.values()))):
+        left = f"{len(failed)} files were left out:\n" if len(messages) > 1 else ""
+        raise ValueError(left + "\n".join(messages))
+
+
+def _require_no_recordings(names: Iterable[str], folder: Path, recordings: Sequence[Path] = ()) -> None:
+    """Check that clips replace no recording: none of ``recordings``, and no other file that is no clip.
 
     Raises:
-        ValueError: If one would replace a recording: one of ``recordings``, or a file that is no clip.
+        ValueError: If one would.
     """
-    paths = {name: folder / f"{name}.npz" for name in motions}
-    for path in filter(Path.exists, paths.values()):
-        if any(map(path.samefile, recordings)) or "character" not in Archive(path).names:
+    for path in filter(Path.exists, (folder / f"{name}.npz" for name in names)):
+        if any(map(path.samefile, recordings)) or not _is_clip(path):
             raise ValueError(f"{path} is a recording that the clip would replace: give another --output")
+
+
+def _is_clip(path: Path) -> bool:
+    try:
+        return "character" in Archive(path).names
+    except MotionFormatError:
+        return False
+
+
+def _save(motions: Mapping[str, Import], folder: Path) -> None:
+    """Write clips into a folder."""
     for name, (clip, *_) in motions.items():
-        with replacing(paths[name]) as partial, partial.open("wb") as file:
+        with replacing(folder / f"{name}.npz") as partial, partial.open("wb") as file:
             clip.save(file)
-    print(f"{_table(motions)}\nwritten to {folder}")
 
 
 def _table(motions: Mapping[str, Import]) -> str:

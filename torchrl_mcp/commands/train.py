@@ -132,7 +132,7 @@ def _resume(cfg: DictConfig) -> Path:
     moves = {name: str(value) for name, value in values.items() if name.split(".")[-1] in places.NAMES}
     if ignored := [str(override.input_line) for override in overrides if override.key_or_group in {*values} - {*moves}]:
         raise ValueError(
-            "a resumed run keeps its settings, except for device, a larger training.total_frames and the places of "
+            "a resumed run keeps its settings, except for device, training.total_frames and the places of "
             f"files: leave out {' '.join(ignored)}"
         )
     if records.is_complete(folder) and total_frames is None:

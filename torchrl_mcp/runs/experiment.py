@@ -45,12 +45,12 @@ def resume(
     Args:
         folder: The run folder.
         device: Device to go on with, or None for the run's own.
-        total_frames: Environment steps of the whole run, more than it has taken, or None for the run's own.
+        total_frames: Environment steps of the whole run, at least those that it has taken, or None for the run's own.
         moves: New places of files and folders outside the run folder, by the names of their settings.
 
     Raises:
-        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, it is longer than
-            ``total_frames``, or this machine lacks the device, the logger or a file.
+        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, it has taken
+            more than ``total_frames``, or this machine lacks the device, the logger or a file. The run is as before.
     """
     if is_complete(folder) and not total_frames and not moves:
         return folder
@@ -58,8 +58,7 @@ def resume(
     if unknown := sorted(set(moves or {}) - set(known)):
         raise ValueError(f"{folder} has no files by {' and '.join(unknown)}, only by {list(known)}: leave them out")
     with lock.held(folder):
-        records.change(folder, total_frames, moves or {})
-        return _resume(folder, device)
+        return _resume(folder, device, total_frames, moves or {})
 
 
 def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
@@ -83,8 +82,7 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
         if is_complete(folder):
             print(f"{folder} is complete: nothing is left to do", flush=True)
         there = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
-        records.change(folder, None, there)
-        return _resume(folder, cfg.device)
+        return _resume(folder, cfg.device, None, there)
 
 
 def _train(plan: Plan) -> Path:
@@ -98,15 +96,19 @@ def _train(plan: Plan) -> Path:
     return _finish(trainer, cfg, plan.folder)
 
 
-def _resume(folder: Path, device: str | None) -> Path:
-    if is_complete(folder):
+def _resume(folder: Path, device: str | None, total_frames: int | None, moves: Mapping[str, str]) -> Path:
+    """Continue a run, whose record changes once its state is restored."""
+    config = records.changed(folder, total_frames, moves)
+    cfg = records.located(config, folder)
+    if is_complete(folder) and is_complete(folder, cfg):
+        records.change(folder, config)
         return folder
-    require_resumable(read_config(folder / CONFIG))
-    cfg = records.run_config(folder)
+    require_resumable(config)
     cfg.device = device or cfg.device
     require_all(cfg)
     print(f"{folder} goes on{records.elsewhere(folder, cfg)}", flush=True)
     trainer = _restored(cfg, folder)
+    records.change(folder, config)
     (folder / EVALUATION).unlink(missing_ok=True)
     return _finish(trainer, cfg, folder)
 

@@ -24,20 +24,30 @@ def run_config(folder: Path) -> DictConfig:
     Raises:
         ValueError: If the folder holds no run, or one of another version of the library.
     """
-    if not (folder / CONFIG).is_file():
-        raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
-    config = read_config(folder / CONFIG)
+    return located(_held(folder), folder)
+
+
+def located(config: Mapping[str, Any], folder: Path) -> DictConfig:
+    """Return the configuration of the run in ``folder`` from a stored one, as :func:`changed` returns.
+
+    Raises:
+        ValueError: If it is of another version of the library.
+    """
     require_known(config, folder / CONFIG)
     return OmegaConf.create(places.located(translated(config), folder))
 
 
-def is_complete(folder: Path) -> bool:
+def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
     """Return whether the run in ``folder`` has taken all its steps and has been evaluated.
+
+    Args:
+        folder: The run folder.
+        cfg: Its configuration, or None to read it.
 
     Raises:
         ValueError: If the folder holds no run.
     """
-    cfg = run_config(folder)
+    cfg = cfg or run_config(folder)
     trained = run_folder.frames(checkpoint.find(folder)) >= cfg.training.total_frames
     return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
 
@@ -95,8 +105,8 @@ def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None
     _write_config(config, folder)
 
 
-def change(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> None:
-    """Change the length of a run, and the places of files outside its folder.
+def changed(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> dict[str, Any]:
+    """Return the stored configuration of a run with another length, and other places of files outside its folder.
 
     Args:
         folder: The run folder.
@@ -104,18 +114,24 @@ def change(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> 
         moves: New places, by the names of their settings; names that the run lacks are ignored.
 
     Raises:
-        ValueError: If the run is planned to be longer.
+        ValueError: If the folder holds no run, or the run has taken more steps.
     """
-    held = read_config(folder / CONFIG)
-    planned = held["training"]["total_frames"]
-    if (total := total_frames or planned) < planned:
-        raise ValueError(f"training.total_frames={total}: {folder} is planned for {planned} steps; give more, or none")
+    held = _held(folder)
+    total = total_frames or held["training"]["total_frames"]
+    if total < (taken := run_folder.frames(checkpoint.find(folder))) and total_frames:
+        raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
     known = places.outside(held)
     new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
-    config = {**places.moved(held, new), "training": {**held["training"], "total_frames": total}}
+    return {**places.moved(held, new), "training": {**held["training"], "total_frames": total}}
+
+
+def change(folder: Path, config: Mapping[str, Any]) -> None:
+    """Store the configuration of a run as :func:`changed`, and its provenance."""
+    held = _held(folder)
+    planned, total = (one["training"]["total_frames"] for one in (held, config))
     if config != held:
         _write_config(config, folder)
-    if total > planned:
+    if total != planned:
         frames = run_folder.frames(checkpoint.find(folder))
         write_json(continuation(_origin(folder), planned, total, frames), folder / PROVENANCE)
 
@@ -147,6 +163,13 @@ def elsewhere(folder: Path, cfg: DictConfig) -> str:
         f" on {now['processor']} ({now['device']}), after it began on {began['processor']} ({began['device']}), with "
         f"networks in {precision} as it began"
     )
+
+
+def _held(folder: Path) -> dict[str, Any]:
+    """Return the configuration in a run folder as it is stored."""
+    if not (folder / CONFIG).is_file():
+        raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
+    return read_config(folder / CONFIG)
 
 
 def _origin(folder: Path) -> dict[str, Any]:
