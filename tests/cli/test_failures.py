@@ -1,10 +1,17 @@
 """What the command says when a run fails: a sentence with what is safe and how to go on."""
 
+import re
+import shutil
+import sys
+from importlib import import_module
+from pathlib import Path
+
 import pytest
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from torchrl_mcp.commands import train
+from torchrl_mcp.envs import characters
 from torchrl_mcp.runs import experiment
 
 
@@ -53,3 +60,27 @@ def test_what_comes_from_outside_ends_in_a_sentence_with_what_is_safe_and_how_to
 )
 def test_a_run_that_cannot_go_on_says_why(cfg, monkeypatch, failure, sentence):
     assert sentence in said(cfg, monkeypatch, failure)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "builtin:biped", "--episodes", "1", "--task", "max_episode_steps=2", "--output", "file/out.json"],
+        ["export", "builtin:biped", "--torch", "file/out.pt2"],
+        ["report", "run", "--output", "file/out"],
+        ["figures", "curves", "run", "--output", "file/out"],
+        ["character", "adapt", "robot.xml", "--name", "robot2", "--output", "file/out"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_result_that_cannot_be_written_ends_in_a_sentence(words, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yaml").write_text("seed: 0")
+    shutil.copy(Path(characters.__file__).with_name("biped.xml"), "robot.xml")
+    (tmp_path / "run/metrics.csv").write_text("iteration,frames,episode/count,episode/normalised_return\n1,128,1,0.5\n")
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as stop:
+        import_module(f"torchrl_mcp.cli.{words[0]}").main()
+    assert re.fullmatch(rf"torchrl-mcp-{words[0]}: .*(File exists|Not a directory): 'file.*'", str(stop.value.code))

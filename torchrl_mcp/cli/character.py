@@ -5,7 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import interruptible, new_parser
+from torchrl_mcp.cli.parsing import explained, new_parser
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-character"
@@ -20,7 +20,7 @@ A PATTERN is a regular expression, which is searched for in the names of joints 
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()
@@ -29,10 +29,7 @@ def main() -> None:
     announce(PROGRAM)
     from torchrl_mcp.commands import character
 
-    try:
-        sys.exit(getattr(character, arguments.run)(arguments))
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    sys.exit(getattr(character, arguments.run)(arguments))
 
 
 def parser() -> argparse.ArgumentParser:

@@ -4,12 +4,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.cli.parsing import explained, new_parser
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-demo"
 
 
+@explained(PROGRAM)
 def main() -> None:
     """Run or continue the demonstration."""
     arguments = parser().parse_args()
@@ -22,7 +23,7 @@ def main() -> None:
     output = arguments.output or Path("runs", "demo-pretrain" if arguments.pretrain else "demo")
     try:
         run(output, arguments.overrides, preset=preset, pretrain=arguments.pretrain)
-    except (HydraException, ValueError) as error:
+    except HydraException as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")

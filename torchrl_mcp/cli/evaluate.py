@@ -5,12 +5,11 @@ With ``--output RUN/evaluation.json`` it writes the file that training writes at
 
 import argparse
 import math
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, count, interruptible, new_parser, settings
+from torchrl_mcp.cli.parsing import add_task, add_trust, count, explained, new_parser, settings
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
@@ -18,24 +17,21 @@ from torchrl_mcp.training.run_folder import write_json
 PROGRAM = "torchrl-mcp-evaluate"
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Play one episode in each of many environments and print the statistics."""
     arguments = parser().parse_args()
-    try:
-        path = locate(arguments.checkpoint)
-        announce(PROGRAM)
-        from torchrl_mcp.commands.task_settings import task_settings
-        from torchrl_mcp.runs.policies import evaluate_clips, evaluation
-        from torchrl_mcp.runs.trust import trusting
+    path = locate(arguments.checkpoint)
+    announce(PROGRAM)
+    from torchrl_mcp.commands.task_settings import task_settings
+    from torchrl_mcp.runs.policies import evaluate_clips, evaluation
+    from torchrl_mcp.runs.trust import trusting
 
-        with trusting(arguments.trust):
-            settings = task_settings(arguments.task)
-            alone = {"episodes": arguments.clips, "seed": arguments.seed, **settings}
-            clips = evaluate_clips(path, **alone) if arguments.clips else []
-            results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed, **settings)
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    with trusting(arguments.trust):
+        settings = task_settings(arguments.task)
+        alone = {"episodes": arguments.clips, "seed": arguments.seed, **settings}
+        clips = evaluate_clips(path, **alone) if arguments.clips else []
+        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed, **settings)
     report(arguments, results, [asdict(clip) for clip in clips])
 
 

@@ -1,10 +1,9 @@
 """``torchrl-mcp-export``: a trained policy for other programs, as ONNX or for ``torch.export.load``."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, explained, new_parser
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 
@@ -19,30 +18,27 @@ examples:
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Write the policy, and print its difference from torch."""
     options = parser()
     arguments = options.parse_args()
     if arguments.onnx is None and arguments.torch is None:
         options.error("say what to write: --onnx FILE, --torch FILE, or both")
-    try:
-        path = locate(arguments.checkpoint)
-        announce(PROGRAM)
-        from torchrl_mcp.runs import export
-        from torchrl_mcp.runs.trust import trusting
+    path = locate(arguments.checkpoint)
+    announce(PROGRAM)
+    from torchrl_mcp.runs import export
+    from torchrl_mcp.runs.trust import trusting
 
-        with trusting(arguments.trust):
-            policy, states = export.example(path)
-        if arguments.torch:
-            export.write_torch(policy, states, arguments.torch)
-            print(arguments.torch)
-        if arguments.onnx:
-            difference = export.write_onnx(policy, states, arguments.onnx)
-            checked = "not checked: onnxruntime is not installed"
-            print(arguments.onnx, checked if difference is None else f"differs from torch by at most {difference:.0e}")
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    with trusting(arguments.trust):
+        policy, states = export.example(path)
+    if arguments.torch:
+        export.write_torch(policy, states, arguments.torch)
+        print(arguments.torch)
+    if arguments.onnx:
+        difference = export.write_onnx(policy, states, arguments.onnx)
+        checked = "not checked: onnxruntime is not installed"
+        print(arguments.onnx, checked if difference is None else f"differs from torch by at most {difference:.0e}")
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,10 +1,9 @@
 """``torchrl-mcp-figures``: the paper's Figures 5, 6 and 7 from trained networks, as PNG and SVG, their data as CSV."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, count, interruptible, new_parser
+from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
@@ -22,20 +21,17 @@ examples:
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()
-    try:
-        arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
-        announce(PROGRAM)
-        from torchrl_mcp.commands import figures
-        from torchrl_mcp.runs.trust import trusting
+    arguments.checkpoints = [locate(name) for name in arguments.checkpoints]
+    announce(PROGRAM)
+    from torchrl_mcp.commands import figures
+    from torchrl_mcp.runs.trust import trusting
 
-        with trusting(arguments.trust):
-            getattr(figures, arguments.draw)(arguments)
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    with trusting(arguments.trust):
+        getattr(figures, arguments.draw)(arguments)
 
 
 def parser() -> argparse.ArgumentParser:

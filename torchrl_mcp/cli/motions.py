@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torchrl_mcp.cli.parsing import interruptible, new_parser, own_module
+from torchrl_mcp.cli.parsing import explained, new_parser, own_module
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -25,7 +25,7 @@ examples:
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()

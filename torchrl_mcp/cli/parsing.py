@@ -29,17 +29,26 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
     return parser
 
 
-def interruptible(main: Callable[[], None]) -> Callable[[], None]:
-    """Return the function of a command that ends with a word when it is interrupted, also during its imports."""
+def explained(program: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
+    """Return a decorator of a command's function that ends it with a sentence if it is interrupted or its input is bad.
 
-    @wraps(main)
-    def run() -> None:
-        try:
-            main()
-        except KeyboardInterrupt:
-            sys.exit("\ninterrupted")
+    Args:
+        program: Name of the command.
+    """
 
-    return run
+    def decorate(main: Callable[[], None]) -> Callable[[], None]:
+        @wraps(main)
+        def run() -> None:
+            try:
+                main()
+            except KeyboardInterrupt:
+                sys.exit(f"\n{program}: interrupted")
+            except (OSError, ValueError) as error:
+                sys.exit(f"{program}: {error}")
+
+        return run
+
+    return decorate
 
 
 def find_own_modules() -> None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_task, add_trust, explained, find_own_modules, new_parser
 from torchrl_mcp.commands import announce
 from torchrl_mcp.evaluation.formats import require_format
 from torchrl_mcp.runs.builtin import locate
@@ -22,6 +22,7 @@ examples:
 """
 
 
+@explained(PROGRAM)
 def main() -> None:
     """Run the command."""
     arguments = parse(sys.argv[1:])
@@ -40,7 +41,7 @@ def main() -> None:
 
         with trusting(arguments.trust):
             play(arguments)
-    except (RuntimeError, ValueError) as error:
+    except RuntimeError as error:
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit()

@@ -1,10 +1,9 @@
 """``torchrl-mcp-publish``: a trained policy as a small file, with a model card."""
 
 import argparse
-import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, count, interruptible, new_parser, settings
+from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser, settings
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-publish"
@@ -18,23 +17,20 @@ examples:
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Write the file and its card."""
     arguments = parser().parse_args()
-    try:
-        if arguments.output.suffix != ".torchrl":
-            raise ValueError(f"{arguments.output} is not the name of a checkpoint: end it with .torchrl")
-        if not arguments.run.is_dir():
-            raise ValueError(f"there is no run folder {arguments.run}")
-        announce(PROGRAM)
-        from torchrl_mcp.commands.publish import publish
-        from torchrl_mcp.runs.trust import trusting
+    if arguments.output.suffix != ".torchrl":
+        raise ValueError(f"{arguments.output} is not the name of a checkpoint: end it with .torchrl")
+    if not arguments.run.is_dir():
+        raise ValueError(f"there is no run folder {arguments.run}")
+    announce(PROGRAM)
+    from torchrl_mcp.commands.publish import publish
+    from torchrl_mcp.runs.trust import trusting
 
-        with trusting(arguments.trust):
-            publish(arguments.run, arguments.output, episodes=arguments.episodes, limits=arguments.limits)
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    with trusting(arguments.trust):
+        publish(arguments.run, arguments.output, episodes=arguments.episodes, limits=arguments.limits)
 
 
 def parser() -> argparse.ArgumentParser:

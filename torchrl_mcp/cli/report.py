@@ -6,13 +6,13 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import interruptible, new_parser
+from torchrl_mcp.cli.parsing import explained, new_parser
 from torchrl_mcp.commands import announce
 
 PROGRAM = "torchrl-mcp-report"
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Read run folders and write the report."""
     arguments = parser().parse_args()
@@ -26,10 +26,7 @@ def main() -> None:
     from torchrl_mcp.report.table_2 import draw_table_2
     from torchrl_mcp.training.run_folder import replacing
 
-    try:
-        runs, damaged = find_runs(arguments.runs)
-    except ValueError as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    runs, damaged = find_runs(arguments.runs)
     pages = report(runs, damaged, moment=datetime.now(UTC))
     for name, text in pages.items():
         with replacing(arguments.output / name) as partial:

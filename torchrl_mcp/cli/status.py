@@ -5,11 +5,12 @@ import sys
 import threading
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.cli.parsing import explained, new_parser
 
 PROGRAM = "torchrl-mcp-status"
 
 
+@explained(PROGRAM)
 def main() -> None:
     """Show the runs of a folder."""
     arguments = parser().parse_args()

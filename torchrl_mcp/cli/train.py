@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from torchrl_mcp.cli.parsing import add_trust, choices, find_own_modules, interruptible, new_parser, take_trust
+from torchrl_mcp.cli.parsing import add_trust, choices, explained, find_own_modules, new_parser, take_trust
 from torchrl_mcp.training.workers import end_with_parent_while_starting, termination_as_interrupt
 
 end_with_parent_while_starting()  # before the imports that take a worker seconds
@@ -48,7 +48,7 @@ examples:
 """
 
 
-@interruptible
+@explained(PROGRAM)
 def main() -> None:
     """Run the command line; if Hydra cannot compose it, say what to write instead."""
     trusted, words = take_trust(sys.argv[1:])
