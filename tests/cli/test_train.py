@@ -146,6 +146,15 @@ def test_what_hydra_cannot_compose_is_answered_in_a_line(command, tmp_path, argu
     assert len(outcome.stderr.splitlines()) == 1
 
 
+def test_options_may_follow_settings_and_a_damaged_file_is_named(command, tmp_path):
+    (tmp_path / "own/method").mkdir(parents=True)
+    (tmp_path / "own/method/cut.yaml").write_text("defaults: [mcp")
+    outcome = command("train", "seed=1", "--config-dir", "own", "method=cut", cwd=tmp_path)
+    assert "a file of settings is no YAML: " in outcome.stderr
+    assert "line 1" in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+
+
 def test_without_assertions_the_remedy_is_said(tmp_path):
     words = [sys.executable, "-O", "-m", "torchrl_mcp.cli.train", "--multirun", "seed=range(0,2)"]
     outcome = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from itertools import pairwise
 
 from torchrl_mcp.cli.parsing import add_trust, choices, explained, find_own_modules, new_parser, take_trust
 from torchrl_mcp.training.workers import end_with_parent_while_starting, termination_as_interrupt
@@ -37,6 +38,9 @@ SETTINGS = {
     "device=cuda": "networks on a GPU; the physics only with physics=warp",
 }
 
+VALUED = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path", "-c", "--cfg", "-p", "--package")
+"""Options whose value is the next word."""
+
 EXAMPLES = f"""\
 examples:
   {PROGRAM} method=scratch task=heading character=biped
@@ -55,6 +59,7 @@ def main() -> None:
     if own := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(own))
     from hydra.errors import HydraException
+    from yaml import YAMLError  # type: ignore[import-untyped]
 
     from torchrl_mcp.commands.suggestions import answer
     from torchrl_mcp.commands.train import run, run_benchmark
@@ -62,7 +67,7 @@ def main() -> None:
 
     if any(word.startswith(("-cd", "--config-dir")) for word in words):
         find_own_modules()
-    sys.argv[1:] = words
+    sys.argv[1:] = options_first(words)
     arguments = [word for word in words if word not in ("-m", "--multirun")]
     is_benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
@@ -70,14 +75,23 @@ def main() -> None:
             run_benchmark(arguments) if is_benchmark else run()
     except HydraException as error:
         sys.exit(f"{PROGRAM}: {answer(error, words, multirun=is_benchmark or arguments != words)}")
-    except ValueError as error:  # of a sweeper, such as Optuna without a completed trial
-        sys.exit(f"{PROGRAM}: {error}")
+    except YAMLError as error:
+        sys.exit(f"{PROGRAM}: a file of settings is no YAML: {' '.join(str(error).split())}")
     except AttributeError:
         if __debug__:
             raise
         sys.exit(
             f"{PROGRAM}: Hydra cannot read ranges and choices without assertions: unset PYTHONOPTIMIZE, or drop -O"
         )
+
+
+def options_first(words: list[str]) -> list[str]:
+    """Return a command line with its options and their values before the settings, where Hydra's parser needs them."""
+    options: list[str] = []
+    settings: list[str] = []
+    for before, word in pairwise(["", *words]):
+        (options if word.startswith("-") or before in VALUED else settings).append(word)
+    return options + settings
 
 
 def parser() -> argparse.ArgumentParser:

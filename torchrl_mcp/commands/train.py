@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -69,7 +70,9 @@ def _explained(cfg: DictConfig) -> Iterator[None]:
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except HydraException as error:
-        sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}")
+        cause = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ else []
+        place = f" ({cause[-1].filename}, line {cause[-1].lineno})" if cause else ""
+        sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}{place}")
     except OSError as error:
         sys.exit(f"{PROGRAM}: {error}. {_what_is_safe(cfg)}")
     except KeyboardInterrupt:

@@ -1,5 +1,6 @@
 """What a run needs beside valid settings: an environment, files, devices, networks, and classes that exist."""
 
+import difflib
 import inspect
 import pkgutil
 from collections.abc import Collection, Mapping
@@ -24,6 +25,7 @@ def require_all(cfg: DictConfig) -> None:
         ValueError: As the functions below, of which the last checks that there are networks to transfer.
     """
     require_environment(cfg)
+    require_callable(OmegaConf.to_container(cfg, resolve=True))
     require_files(cfg, cfg.task[cfg.stage.name])
     require_equipment(cfg)
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
@@ -56,6 +58,28 @@ def require_environment(cfg: DictConfig) -> None:
     if able and character not in able:
         known = " or ".join(able)
         raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+
+
+def require_callable(config: Any, path: str = "") -> None:
+    """Check that the classes and functions in a configuration take the arguments that it gives them.
+
+    Args:
+        config: The configuration, without references.
+        path: Its name, the beginning of those in an error.
+
+    Raises:
+        ValueError: If one does not, with the nearest that it takes.
+    """
+    if isinstance(config, Mapping):
+        name = config.get("_target_")
+        if isinstance(name, str) and _exists(name) and not any(map(_is_open, (taken := arguments(name)).values())):
+            for key in config:
+                if key not in taken and not str(key).startswith("_"):
+                    near = difflib.get_close_matches(str(key), taken, cutoff=0.5) or sorted(taken)
+                    raise ValueError(f"{path}.{key} is no argument of {name}; the nearest are: {', '.join(near)}")
+    items = config.items() if isinstance(config, Mapping) else enumerate(config) if isinstance(config, list) else ()
+    for key, value in items:
+        require_callable(value, f"{path}.{key}" if path else str(key))
 
 
 def require_files(cfg: DictConfig, task: DictConfig) -> None:
@@ -146,7 +170,7 @@ def require_arguments(name: str, given: Collection[str]) -> None:
     taken = arguments(name)
     if unknown := [argument for argument in given if argument not in taken]:
         tasks_own = {*inspect.signature(CharacterEnv.__init__).parameters} - {"max_episode_steps"}
-        listed = sorted({*taken} - tasks_own - {"kwargs", "character"})
+        listed = sorted({*taken} - tasks_own - {"character"})
         raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 
@@ -164,16 +188,23 @@ def require_entry(env: CharacterEnv, name: str) -> slice:
 
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a class or function by its name, with those that a class passes on to its bases."""
+    """Return the parameters of a class or function by its name, with those that a class passes on to its bases.
+
+    There is a parameter ``**kwargs`` among them if no base refuses unknown arguments.
+    """
     made = pkgutil.resolve_name(name)
     kinds = made.__mro__ if inspect.isclass(made) else ()
     found: dict[str, inspect.Parameter] = {}
     for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
         parameters = inspect.signature(maker).parameters
         found = {**parameters, **found}
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-            break
+        if not any(map(_is_open, parameters.values())):
+            return {name: parameter for name, parameter in found.items() if not _is_open(parameter)}
     return found
+
+
+def _is_open(parameter: inspect.Parameter) -> bool:
+    return parameter.kind is parameter.VAR_KEYWORD
 
 
 def import_own(module: str, origin: str) -> None:
