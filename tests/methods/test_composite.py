@@ -126,3 +126,9 @@ def test_the_gate_learns_from_frozen_primitives_as_from_others(mixer, make_actor
     for free, frozen in zip(*gradients.values(), strict=True):
         assert free.abs().max() > 0
         torch.testing.assert_close(free, frozen)
+
+
+@pytest.mark.parametrize("activation", [nn.Tanh(), nn.LeakyReLU(), nn.Softshrink()], ids=lambda one: type(one).__name__)
+def test_weights_that_compose_nothing_are_refused_before_training(composite, activation):
+    with pytest.raises(ValueError, match="end it with a sigmoid, a softmax or a softplus"):
+        composite(gate_activation=activation, distribution_class=MultiplicativeGaussian)

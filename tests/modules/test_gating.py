@@ -1,3 +1,4 @@
+import copy
 import math
 
 import pytest
@@ -5,7 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from torchrl_mcp.modules import Gating, JointGating, gate_diagnostics
+from torchrl_mcp.modules import Gating, JointGating, Primitives, StateGoalEncoder, gate_diagnostics
 
 
 def count(module):
@@ -149,3 +150,15 @@ def test_a_joint_gate_is_one_network_over_state_and_goal():
 def test_logits_stay_float32_under_autocast(gate):
     with torch.autocast("cpu", torch.bfloat16):
         assert gate(27, 2, 8)(torch.randn(10, 27), torch.randn(10, 2)).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "network", [Gating(3, 2, 4), JointGating(3, 2, 4), StateGoalEncoder(3, 2, 4), Primitives(3, 2, 4)]
+)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_networks_compute_in_their_own_precision_and_return_at_least_single(network, dtype):
+    network = copy.deepcopy(network).to(dtype)
+    inputs = [torch.ones(3, dtype=dtype), torch.ones(2, dtype=dtype)]
+    outputs = network(*inputs[: 1 if isinstance(network, Primitives) else 2])
+    last = outputs[-1] if isinstance(outputs, tuple) else outputs
+    assert last.dtype == torch.promote_types(dtype, torch.float32)

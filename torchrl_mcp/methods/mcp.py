@@ -51,13 +51,13 @@ def composite_parts(
             normalised states and actions.
 
     Raises:
-        ValueError: If ``num_primitives`` is not positive.
+        ValueError: If ``num_primitives`` is not positive, or weights are negative, not finite or all zero.
     """
     if num_primitives < 1:
         raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
     # A composite's standard deviation is proportional to its primitives'. First compose K unit Gaussians at the gate's
     # initial weights and divide. Then do the same with the networks, whose primitives have different means.
-    gates = gate_activation(torch.zeros(num_primitives))
+    gates = _valid(gate_activation(torch.zeros(num_primitives)))
     unit = torch.ones(num_primitives, 1)
     composite = distribution_class(torch.zeros_like(unit), unit, gates)
     gate = gating(sizes.observation, sizes.goal, num_primitives)
@@ -67,7 +67,8 @@ def composite_parts(
     with torch.no_grad():
         states, goals = _normalised_inputs(sizes.observation, sizes.goal)
         loc, scale = networks(states)
-        composite = distribution_class(loc, scale, gate_activation(gate(states, goals)))
+        weights = _valid(gate_activation(gate(states, goals)))
+        composite = distribution_class(loc, scale, weights)
         networks.rescale(initial_std / composite.stddev.square().mean().sqrt().item())
     return nn.ModuleDict(
         {
@@ -76,6 +77,16 @@ def composite_parts(
             "primitives": networks,
         }
     )
+
+
+def _valid(weights: Tensor) -> Tensor:
+    """Return weights ``(*B, K)`` of a gate, if primitives can be composed with them."""
+    if not (weights.isfinite().all() and (weights >= 0).all() and (weights.sum(-1) > 0).all()):
+        raise ValueError(
+            "gating.activation makes weights that are negative, not finite or all zero, with which no primitives can "
+            "be composed: end it with a sigmoid, a softmax or a softplus"
+        )
+    return weights
 
 
 def _normalised_inputs(observation_dim: int, goal_dim: int, num: int = 1024) -> tuple[Tensor, Tensor]:

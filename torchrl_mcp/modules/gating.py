@@ -53,7 +53,7 @@ class Gating(nn.Module):
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
         features = torch.cat([self.state_encoder(observation), self.goal_encoder(goal)], dim=-1)
-        return self.output(self.joint(features)).float()
+        return at_least_single(self.output(self.joint(features)))
 
 
 class JointGating(nn.Module):
@@ -88,7 +88,7 @@ class JointGating(nn.Module):
 
     def forward(self, observation: Tensor, goal: Tensor) -> Tensor:
         """Return logits ``(*B, K)`` from a state ``(*B, S)`` and a goal ``(*B, G)``."""
-        return self.output(self.body(observation, goal)).float()
+        return at_least_single(self.output(self.body(observation, goal)))
 
 
 def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
@@ -112,6 +112,11 @@ def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:
         activation_class=nn.ReLU,
         activate_last_layer=True,
     )
+
+
+def at_least_single(values: Tensor) -> Tensor:
+    """Return values of half precision as ``float32``, and others as they are."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def scaled_linear(in_features: int, out_features: int, gain: float) -> nn.Linear:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp, scaled_cells
+from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
 
 
 class StateGoalEncoder(nn.Module):
@@ -40,7 +40,7 @@ class StateGoalEncoder(nn.Module):
         return self._gaussian(observation, goal)
 
     def _gaussian(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        loc, log_scale = self.output(self.body(*inputs)).float().chunk(2, dim=-1)
+        loc, log_scale = at_least_single(self.output(self.body(*inputs))).chunk(2, dim=-1)
         return loc, log_scale.exp()
 
 

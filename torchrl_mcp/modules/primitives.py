@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from torchrl_mcp.modules.gating import relu_mlp, scaled_cells
+from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
 
 
 class Primitives(nn.Module):
@@ -67,7 +67,7 @@ class Primitives(nn.Module):
         if self.branches is not None:
             features = self.rectifier(self.branches(features))
         loc, log_scale = self.output(features).chunk(2, dim=-1)
-        return loc, log_scale.float().exp()
+        return loc, at_least_single(log_scale).exp()
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:

@@ -37,7 +37,7 @@ def policy_config(path: Path) -> DictConfig:
 
 
 def restore(
-    path: Path, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
+    path: Path | str, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
 ) -> tuple[DictConfig, Agent, CharacterEnv | TransformedCharacterEnv]:
     """Return configuration, trained agent and new environments from a run folder or checkpoint file.
 
@@ -52,7 +52,7 @@ def restore(
     Raises:
         ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
     """
-    file = checkpoint.find(path)
+    file = checkpoint.find(Path(path))
     cfg = policy_config(file)
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
