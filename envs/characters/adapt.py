@@ -73,8 +73,8 @@ def adapted(
     Floor, lights, cameras, tendons, equality constraints and sensors are left out, and shapes that do not collide if
     they are meshes; cylinders become capsules and ellipsoids boxes. Several hinges of a body become a ball joint, whose
     targets have the ranges of the hinges about each axis. Each joint gets a position servo, see
-    :func:`~torchrl_mcp.envs.characters.drives.drive`. The body is put on the ground. Masses, inertias, ranges of
-    hinges, and damping, stiffness and friction loss of joints stay the same.
+    :func:`~torchrl_mcp.envs.characters.drives.drive`. The body is put on the ground. Masses, inertias, gravity
+    compensation, ranges of hinges, and damping, stiffness and friction loss of joints stay the same.
 
     Args:
         model: The body in its scene, compiled.
@@ -133,6 +133,7 @@ def _standing(model: mujoco.MjModel, names: Mapping[int, str], rest: Pose) -> mu
             ipos=model.body_ipos[body],
             iquat=model.body_iquat[body],
             inertia=_possible(model.body_inertia[body]),
+            gravcomp=model.body_gravcomp[body],
         )
         _add_joint(bodies[body], name, model, body, rest)
         _add_shapes(bodies[body], model, body)
@@ -191,10 +192,16 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
         kinds = kinds_of(model, body)
         if any(kind not in (BALL, HINGE) for kind in kinds) or (BALL in kinds and len(kinds) > 1):
             raise ValueError(f"{names[body]} has a joint that is neither hinge nor ball: replace or weld it")
-    for geom in colliding(model):
+    for geom in _touching(model):
         kind = mujoco.mjtGeom(model.geom_type[geom])
         if kind not in KINDS and model.geom_bodyid[geom] in names:
             raise ValueError(f"{model.geom(geom).name or geom} is a {kind.name} that collides: draw capsules or boxes")
+
+
+def _touching(model: mujoco.MjModel) -> set[int]:
+    """Return the shapes of moving bodies that collide, in general or in pairs that the file names."""
+    paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
+    return {*colliding(model), *(geom for geom in paired if model.geom_bodyid[geom] > 0)}
 
 
 def _possible(inertia: np.ndarray) -> np.ndarray:
@@ -256,7 +263,7 @@ def _ranges(model: mujoco.MjModel, body: int, rest: Pose) -> np.ndarray:
 def _add_servos(spec: mujoco.MjSpec, name: str, chosen: Drive, ranges: np.ndarray) -> None:
     """Add the servo of a hinge, or the three of a ball joint."""
     suffixes = [""] if len(ranges) == 1 else ["_x", "_y", "_z"]
-    for suffix, gear, (low, high) in zip(suffixes, np.eye(6), ranges, strict=False):
+    for suffix, gear, limit, (low, high) in zip(suffixes, np.eye(6), chosen.limits, ranges, strict=False):
         middle, half = (low + high) / 2, BEYOND * (high - low) / 2
         actuator = spec.add_actuator(
             name=name + suffix,
@@ -266,20 +273,21 @@ def _add_servos(spec: mujoco.MjSpec, name: str, chosen: Drive, ranges: np.ndarra
             ctrllimited=True,
             ctrlrange=[middle - half, middle + half],
             forcelimited=True,
-            forcerange=[-chosen.torque, chosen.torque],
+            forcerange=[-limit, limit],
         )
         actuator.set_to_position(kp=chosen.gain, kv=chosen.damping)
 
 
 def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> None:
     """Add a body's shapes; decorative shapes of other kinds are left out."""
+    touching = _touching(model)
     for geom in np.flatnonzero(model.geom_bodyid == body):
         kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom].copy()
         if kind not in KINDS:
             continue
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
             size[1] = max(size[1] - size[0], 0.001)
-        collides = bool(model.geom_contype[geom] | model.geom_conaffinity[geom])
+        collides = geom in touching
         target.add_geom(
             name=model.geom(geom).name,
             type=KINDS[kind],

@@ -24,6 +24,9 @@ STEADY = 2.0
 LEAST = 0.005
 """Least guessed torque, in weights of the body times the height of its root."""
 
+LEAST_APART = 1e-3
+"""Distance in metres of a body's hinges that is told of."""
+
 FILE, GIVEN, GUESSED = "file", "given", "guessed"
 
 
@@ -31,8 +34,9 @@ class Drive(NamedTuple):
     """Drive of a body's joint.
 
     Args:
-        torque: Limit of the torque, in N m.
+        torque: Limit of the torque, in N m; of several hinges the largest.
         torque_from: ``"file"``, ``"given"`` or ``"guessed"``.
+        limits: Limits of the torques about x, y and z; of a single hinge they are the same.
         gain: Stiffness kp of the servo, in N m/rad.
         gain_from: As ``torque_from``.
         damping: Damping kv of the servo, in N m s/rad.
@@ -45,6 +49,7 @@ class Drive(NamedTuple):
 
     torque: float
     torque_from: str
+    limits: tuple[float, ...]
     gain: float
     gain_from: str
     damping: float
@@ -142,7 +147,8 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
     """Choose the drive of a body's joint.
 
     Damping that the file lacks is critical for a joint of ``gain / 400`` kg m^2, as in the library's characters:
-    a tenth of the gain, three quarters of it in the servo. The armature is raised where a light limb would chatter
+    a tenth of the gain, three quarters of it in the servo. Each hinge of several keeps its torque about its axis; about
+    an axis without a hinge the limit is the smallest. The armature is raised where a light limb would chatter
     between the limits of its torque, or its servo would be unstable at the physics step.
 
     Args:
@@ -154,8 +160,11 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
     """
     joints = joints_of(model, body)
     dofs = [dof for joint in joints for dof in np.flatnonzero(model.dof_jntid == joint)]
-    own = Motor(*np.max([motor(model, joint) for joint in joints], axis=0).tolist())
+    motors = [motor(model, joint) for joint in joints]
+    own = Motor(*np.max(motors, axis=0).tolist())
     limit, limit_from = _chosen(torque, own.torque, needed.torque)
+    hinges = [motor.torque for motor in motors]
+    limits = _about_axes(model.jnt_axis[joints], hinges) if limit_from == FILE and all(hinges) else [limit] * 3
     kp, kp_from = _chosen(gain, own.gain, max(limit / LIMIT_ANGLE, needed.gain))
     passive = float(model.dof_damping[dofs].max())
     damping = own.damping if kp_from == FILE and (own.damping or passive) else 0.075 * kp
@@ -165,6 +174,7 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
     return Drive(
         limit,
         limit_from,
+        tuple(limits),
         kp,
         kp_from,
         damping,
@@ -172,13 +182,23 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
         steady,
         friction=float(model.dof_frictionloss[dofs].max()),
         spring=float(model.jnt_stiffness[joints].max()),
-        remark=", ".join(_remarks(len(joints), armature, steady)),
+        remark=", ".join(_remarks(model.jnt_pos[joints], limits, armature, steady)),
     )
 
 
-def _remarks(joints: int, armature: float, steady: float) -> Iterator[str]:
-    if joints > 1:
-        yield f"a ball for {joints} hinges"
+def _about_axes(axes: np.ndarray, torques: Sequence[float]) -> list[float]:
+    """Return the torques of hinges with axes ``(N, 3)`` about x, y and z: the smallest where there is no hinge."""
+    parts = (abs(axes) * np.asarray(torques)[:, None]).max(0)
+    return np.maximum(parts, min(torques)).tolist()
+
+
+def _remarks(anchors: np.ndarray, limits: Sequence[float], armature: float, steady: float) -> Iterator[str]:
+    if len(anchors) > 1:
+        yield f"a ball for {len(anchors)} hinges"
+        if (apart := float(np.ptp(anchors, axis=0).max())) > LEAST_APART:
+            yield f"whose anchors, {100 * apart:.2g} cm apart, are one in their middle"
+        if min(limits) < max(limits):
+            yield f"torques {', '.join(f'{limit:.3g}' for limit in limits)} about x, y, z"
     if 0 < armature < steady:
         yield f"armature {armature:.3g} raised"
 

@@ -79,7 +79,11 @@ class Pose(NamedTuple):
 def _hinges(model: mujoco.MjModel, pattern: str, word: str) -> list[int]:
     hinges = np.flatnonzero(model.jnt_type == HINGE).tolist()
     names = {hinge: model.joint(hinge).name for hinge in hinges}
-    if found := [hinge for hinge in hinges if re.search(pattern, names[hinge])]:
+    try:
+        found = [hinge for hinge in hinges if re.search(pattern, names[hinge])]
+    except re.error as error:
+        raise ValueError(f"--pose {word}: {pattern} is no regular expression: {error}") from error
+    if found:
         return found
     raise ValueError(f"--pose {word} matches no hinge: they are {', '.join(names.values())}")
 

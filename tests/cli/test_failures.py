@@ -63,6 +63,26 @@ def test_a_run_that_cannot_go_on_says_why(cfg, monkeypatch, failure, sentence):
 
 
 @pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["evaluate", "run", "--seed", "-1"], "--seed: '-1' is no whole number from 0 to 4294967295"),
+        (["evaluate", "run", "--episodes", "0"], "--episodes: '0' is no whole number of at least 1"),
+        (["play", "run", "--viewer", "web", "--port", "70000"], "--port: '70000' is no whole number from 0 to 65535"),
+        (
+            ["evaluate", "builtin:biped", "--task", "max_episode_steps=abc"],
+            "--task max_episode_steps=abc must be a whole number, at least 1",
+        ),
+    ],
+    ids=lambda words: words[-1],
+)
+def test_an_option_with_a_wrong_value_is_named_with_its_rule(words, sentence, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as stop:
+        import_module(f"torchrl_mcp.cli.{words[0]}").main()
+    assert sentence in f"{stop.value.code}{capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize(
     "words",
     [
         ["evaluate", "builtin:biped", "--episodes", "1", "--task", "max_episode_steps=2", "--output", "file/out.json"],

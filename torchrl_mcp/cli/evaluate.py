@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, count, explained, new_parser, settings
+from torchrl_mcp.cli.parsing import add_task, add_trust, count, explained, new_parser, seed, settings
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import write_json
@@ -74,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
     defaults = settings("train")["evaluation"]
     for name, kind, meaning in (
         ("episodes", count, "episodes, one per environment"),
-        ("seed", int, "seed of environments and sampling"),
+        ("seed", seed, "seed of environments and sampling"),
     ):
         parser.add_argument(f"--{name}", type=kind, default=defaults[name], help=f"{meaning} (default %(default)s)")
     parser.add_argument(

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser
+from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser, seed
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     )
     shared.add_argument("--output", type=Path, default=Path("figures"), help="folder (default %(default)s)")
     add_trust(shared)
-    shared.add_argument("--seed", type=int, default=0, help="seed of random numbers (default %(default)s)")
+    shared.add_argument("--seed", type=seed, default=0, help="seed of random numbers (default %(default)s)")
 
     command = commands.add_parser("curves", parents=[shared], help="learning curves of run folders in one figure")
     command.set_defaults(draw="curves")

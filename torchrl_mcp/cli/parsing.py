@@ -65,8 +65,23 @@ def own_module(name: str) -> str:
 
 def count(text: str) -> int:
     """Return a number of at least 1."""
-    if not text.isdecimal() or not int(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 1")
+    return _whole(text, 1, None)
+
+
+def seed(text: str) -> int:
+    """Return a seed that all generators take."""
+    return _whole(text, 0, 2**32 - 1)
+
+
+def port(text: str) -> int:
+    """Return a port, 0 for any."""
+    return _whole(text, 0, 65535)
+
+
+def _whole(text: str, low: int, high: int | None) -> int:
+    if not text.isdecimal() or int(text) < low or (high is not None and int(text) > high):
+        limits = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
     return int(text)
 
 

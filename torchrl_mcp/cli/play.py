@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, explained, find_own_modules, new_parser
+from torchrl_mcp.cli.parsing import add_task, add_trust, explained, find_own_modules, new_parser, port, seed
 from torchrl_mcp.commands import announce
 from torchrl_mcp.evaluation.formats import require_format
 from torchrl_mcp.runs.builtin import locate
@@ -76,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: folder of your own settings"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of environment and sampling (default %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of environment and sampling (default %(default)s)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions (default: deterministic)")
     add_task(parser)
     parser.add_argument(
@@ -98,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
         help="show it live instead: in a browser on this machine, or in a window",
     )
     viewer.add_argument("--watch", action="store_true", help="for a run in training: play each new checkpoint")
-    viewer.add_argument("--port", type=int, default=0, help="port of the page (default: the first free one from 8080)")
+    viewer.add_argument("--port", type=port, default=0, help="port of the page (default: the first free one from 8080)")
     viewer.add_argument(
         "--host",
         default="127.0.0.1",

@@ -4,9 +4,14 @@ from typing import Any, cast
 
 from omegaconf import OmegaConf
 
+from torchrl_mcp.runs.validation import wrong_values
+
 
 def task_settings(words: list[str]) -> dict[str, Any]:
     """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
     if lost := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
-    return cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
+    settings = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
+    if wrong := list(wrong_values(settings)):
+        raise ValueError("\n".join(f"--task {line}" for line in wrong))
+    return settings

@@ -140,17 +140,26 @@ def require_valid(config: Mapping[str, Any]) -> None:
     """
     lost = [name for name in GROUPS if not isinstance(config.get(name), Mapping)]
     wrong = [f"{name}={_shown(config.get(name))} must be a group of settings" for name in lost]
-    for path, value in _settings(config):
-        if value == "???":
-            wrong.append(f"{path} is needed: pass {path}=...")
-        elif (rule := _rule(path)) and not rule.allows(value):
-            wrong.append(f"{path}={_shown(value)} must be {rule.words}")
+    wrong += wrong_values(config)
     if not wrong and (schedule := config["optimizer"].get("schedule")):
         wrong += _step_size_beyond(config["step_size"]["actor"], schedule)
     if not wrong and _escapes(str(config["run_dir"]), str(config["run_root"])):
         wrong.append(f"run_dir={config['run_dir']} leaves run_root={config['run_root']}: pass a run_dir")
     if wrong:
         raise ValueError("\n".join(wrong))
+
+
+def wrong_values(config: Mapping[str, Any]) -> Iterator[str]:
+    """Say for each setting with a wrong value, or none, what it must be.
+
+    Args:
+        config: Settings, in groups or not.
+    """
+    for path, value in _settings(config):
+        if value == "???":
+            yield f"{path} is needed: pass {path}=..."
+        elif (rule := _rule(path)) and not rule.allows(value):
+            yield f"{path}={_shown(value)} must be {rule.words}"
 
 
 def _step_size_beyond(actor: float, schedule: Mapping[str, Any]) -> Iterator[str]:

@@ -123,6 +123,32 @@ def test_the_written_servo_has_the_drive_that_is_reported():
     assert servo.forcerange.tolist() == [-139, 139]
 
 
+def test_every_hinge_of_several_keeps_its_torque_and_what_is_joined_is_told():
+    hip = '<joint axis="{}" pos="{} 0 0" range="-1 1" actuatorfrcrange="-{} {}"/>'
+    hips = hip.format("1 0 0", 0, 60, 60) + hip.format("0 0 1", 0.02, 20, 20)
+    xml = ROBOT.format(**PLAIN).partition("<keyframe>")[0] + "</mujoco>"
+    xml = xml.replace('<joint name="right_hip" axis="0 1 0" range="-1.5 1.5" />', hips)
+    xml = xml.replace('name="right_thigh"', 'name="right_thigh" gravcomp="0.5"')
+    body = adapted(mujoco.MjModel.from_xml_string(xml))
+    model = body.spec.compile()
+    ranges = {axis: model.actuator(f"right_thigh_{axis}").forcerange.tolist() for axis in "xyz"}
+    assert ranges == {"x": [-60, 60], "y": [-20, 20], "z": [-20, 20]}
+    assert model.joint("right_thigh").pos.tolist() == [0.01, 0, 0]
+    assert model.body_gravcomp[model.body("right_thigh").id] == 0.5
+    assert body.drives["right_thigh"].remark == (
+        "a ball for 2 hinges, whose anchors, 2 cm apart, are one in their middle, torques 60, 20, 20 about x, y, z"
+    )
+
+
+def test_shapes_that_touch_in_named_pairs_alone_are_feet():
+    xml = ROBOT.format(**PLAIN | {"scenery": '<geom name="floor" type="plane" size="1 1 1"/>'})
+    xml = xml.replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    pairs = "".join(f'<pair geom1="floor" geom2="{side}_sole"/>' for side in ("right", "left"))
+    body = adapted(mujoco.MjModel.from_xml_string(xml.replace("<actuator>", f"<contact>{pairs}</contact><actuator>")))
+    assert body.feet == ("right_shin", "left_shin")
+    assert lowest_bodies(body.spec.compile())[1] == ["right_shin", "left_shin"]
+
+
 def test_a_leg_without_motors_can_carry_the_weight_above_it():
     drive = adapted(robot()).drives["right_shin"]
     above = 9.81 * (30 + 2 * (1 + 0.5 + 0.5) - 1)  # all but this shin with its sole, on one leg
@@ -226,6 +252,7 @@ def test_the_action_zero_is_the_rest_pose(tmp_path, monkeypatch):
         (["kneel"], "--pose kneel is no keyframe of the file: its keyframes are crouch"),
         (["ankle=1"], "--pose ankle=1 matches no hinge: they are right_hip, right_knee, left_hip, left_knee"),
         (["knee=bent"], "--pose knee=bent: 'bent' is no angle in radians"),
+        (["knee(=1"], r"--pose knee\(=1: knee\( is no regular expression: missing \)"),
     ],
 )
 def test_a_pose_that_is_none_is_refused(pose, message):
