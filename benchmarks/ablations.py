@@ -14,7 +14,7 @@ from typing import Any
 
 from archive import EMPTY, archived, average, score, write_tables
 
-from torchrl_mcp.report.comparison import Cell
+from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.runs.tables import text_table
 
 RESULTS = Path(__file__).resolve().parent / "results" / "ablations"

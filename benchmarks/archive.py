@@ -19,7 +19,8 @@ from report import write
 
 from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.report.comparison import DEFAULT, Cell, cells
+from torchrl_mcp.report.cell import DEFAULT, Cell
+from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.paper import PLACES
 from torchrl_mcp.report.results import MODES, Run, find_runs
 from torchrl_mcp.runs.tables import text_table

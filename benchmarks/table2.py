@@ -19,7 +19,7 @@ from typing import Any
 from archive import EMPTY, archived, is_short, score, share, write_tables
 
 from torchrl_mcp.analysis.figures import save_figure
-from torchrl_mcp.report.comparison import Cell
+from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
 from torchrl_mcp.report.table_2 import average, compared, draw_over_rows, draw_table_2
 from torchrl_mcp.runs.tables import text_table

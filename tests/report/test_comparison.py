@@ -168,6 +168,13 @@ def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_r
     ]
 
 
+def test_an_evaluation_in_other_episodes_than_configured_is_remarked(write_run):
+    planned = {"evaluation__episodes": 128, "evaluation__seed": 12345}
+    runs = [write_run(f"{seed}", seed=seed, score=0.5, episodes=32, **planned) for seed in range(2)]
+    (cell,) = grouped(*runs)
+    assert cell.remarks == ["seeds 0, 1 evaluated in 32 episodes of seed 12345, which training would not do"]
+
+
 def test_evaluations_in_different_tasks_are_remarked(write_run):
     environments = [{"speed": 1.0, "success_reward": rewarded} for rewarded in (False, True)]
     (cell,) = grouped(*(write_run(str(i), seed=i, score=0.5, environment=use) for i, use in enumerate(environments)))

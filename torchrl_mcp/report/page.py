@@ -9,7 +9,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_mcp import __version__
-from torchrl_mcp.report.comparison import Cell, cells, methods
+from torchrl_mcp.report.cell import Cell
+from torchrl_mcp.report.comparison import cells, methods
 from torchrl_mcp.report.paper import TABLE_2
 from torchrl_mcp.report.results import MODES, STATES, Damaged, Run
 from torchrl_mcp.report.sections import (

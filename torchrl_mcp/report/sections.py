@@ -8,7 +8,8 @@ from typing import Any
 
 from torchrl_mcp.analysis.curves import learning_curves, plot_curves
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, colours, new_figure
-from torchrl_mcp.report.comparison import Cell, ablations, caveats, methods
+from torchrl_mcp.report.cell import Cell
+from torchrl_mcp.report.comparison import ablations, caveats, methods
 from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.report.svg import inline_svg
 from torchrl_mcp.report.usage import diagnostics, usage, verdict

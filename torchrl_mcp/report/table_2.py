@@ -9,7 +9,8 @@ from matplotlib.patches import Patch
 
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
 from torchrl_mcp.evaluation.statistics import Estimate, interquartile_mean, probability_of_improvement
-from torchrl_mcp.report.comparison import Cell, methods
+from torchrl_mcp.report.cell import Cell
+from torchrl_mcp.report.comparison import methods
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
 
 BAR = 0.38

@@ -4,7 +4,7 @@ import math
 
 from torchrl_mcp.evaluation.diagnostics import COLLAPSED
 from torchrl_mcp.evaluation.statistics import shared_means
-from torchrl_mcp.report.comparison import Cell
+from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.results import Run
 
 WIDE_OPEN = 0.95

@@ -1,0 +1,225 @@
+"""A cell of a table of results: runs that differ only in their seeds, and its numbers."""
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import fmean
+from typing import Any, TypeVar
+
+from torchrl_mcp.evaluation.statistics import Estimate, deviation, mean, shared_means
+from torchrl_mcp.report.paper import TABLE_2, Reported
+from torchrl_mcp.report.results import Run
+
+Key = TypeVar("Key", bound=Hashable)
+Item = TypeVar("Item")
+
+DEFAULT = "default"
+"""Value of an argument that a run's configuration does not set."""
+
+SEED = re.compile(r"/seed\d+(?=/|$)|-\d{1,3}(?=\.torchrl$)")
+"""The seed in the path of a run folder, or in the name of published networks; a checkpoint's steps have more digits."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs that differ only in their seeds, according to their configurations.
+
+    Attributes:
+        place: Task and character.
+        stage: ``pretrain`` or ``transfer``.
+        method: Name of the method.
+        settings: Settings that differ from other cells of the same place, stage and method.
+        choices: :func:`~torchrl_mcp.report.comparison.choices` of the runs.
+        runs: The runs, ordered by seed.
+    """
+
+    place: tuple[str, str]
+    stage: str
+    method: str
+    settings: Mapping[str, Any]
+    choices: Mapping[str, Any]
+    runs: Sequence[Run]
+
+    @cached_property
+    def complete(self) -> list[Run]:
+        """Runs that are trained and evaluated; means leave out the others."""
+        return [run for run in self.runs if run.state == "complete"]
+
+    @cached_property
+    def by_seed(self) -> dict[int, list[Run]]:
+        """Complete runs by seed: several if benchmarks that share a folder stored the same run."""
+        return grouped(self.complete, lambda run: run.seed)
+
+    @property
+    def begun(self) -> int:
+        """Number of seeds with a run in any state."""
+        return len({run.seed for run in self.runs})
+
+    @property
+    def title(self) -> str:
+        """Title of the method."""
+        return self.runs[0].title
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of a whole run."""
+        return self.runs[0].total_frames
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether the settings are the method's standard ones, so that the cell is no variant.
+
+        Unless the method says otherwise, a new gate is standard, and no use of the character's symmetry.
+        """
+        standard = {"gate": None, "symmetry": None} | self.runs[0].standard
+        if self.stage == "pretrain":
+            standard.pop("trained", None)  # a choice of transfer: pre-training trains all parts
+        return all(self.choices[name] == value for name, value in standard.items())
+
+    @property
+    def reported(self) -> Reported | None:
+        """The paper's figure, if it has one."""
+        comparable = self.stage == "transfer" and self.is_standard
+        return TABLE_2.get((*self.place, self.method)) if comparable else None
+
+    def returns(self, mode: str = "deterministic") -> list[float]:
+        """Normalised returns by seed, each a mean over the episodes of its complete runs."""
+        return [fmean(run.evaluation[mode]["normalised_return"] for run in runs) for runs in self.by_seed.values()]
+
+    def mean(self, mode: str = "deterministic") -> Estimate | None:
+        """Mean over seeds with its interval; for a single seed, the interval is over its episodes."""
+        returns = self.returns(mode)
+        if len(returns) == 1:
+            intervals = (run.evaluation[mode]["interval"] for run in self.complete)
+            return Estimate(*returns, *map(fmean, zip(*intervals, strict=True)))
+        return mean(returns) if returns else None
+
+    @property
+    def spread(self) -> str:
+        """Name of the mean's interval: a bootstrap of two or three seeds is their range."""
+        return "range " if len(self.by_seed) in (2, 3) else ""
+
+    def deviation(self, mode: str = "deterministic") -> float:
+        """Standard deviation over seeds, NaN of fewer than two."""
+        return deviation(self.returns(mode))
+
+    @property
+    def gap(self) -> float | None:
+        """Our deterministic mean over seeds less the paper's."""
+        ours = self.mean()
+        return ours.value - self.reported.mean if ours and self.reported else None
+
+    @property
+    def seconds(self) -> float:
+        """Mean wall time of the complete runs, or of all runs if none is complete."""
+        runs = self.complete or self.runs
+        return sum(run.seconds for run in runs) / len(runs)
+
+    @property
+    def speed(self) -> float:
+        """Environment steps per second of all runs together, NaN before the first."""
+        seconds = sum(run.seconds for run in self.runs)
+        return sum(run.frames for run in self.runs) / seconds if seconds else math.nan
+
+    @property
+    def commits(self) -> list[str]:
+        """Commits of the runs."""
+        return list(dict.fromkeys(run.commit for run in self.runs))
+
+    @property
+    def standing(self) -> str:
+        """Progress of the runs, for a cell without a complete one."""
+        if any(run.state == "unfinished" for run in self.runs):
+            return f"{sum(run.progress for run in self.runs) / len(self.runs):.0%} trained"
+        return self.runs[0].state
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Means over seeds of the metrics of deterministic episodes, without the terms of the reward."""
+        return shared_means([run.evaluation["deterministic"].get("metrics", {}) for run in self.complete], "reward_")
+
+    @property
+    def reach(self) -> dict[str, float]:
+        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes, if the task has them."""
+        return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks on the reliability of the numbers."""
+        standings = grouped((run for run in self.runs if run.state != "complete"), _standing)
+        others = [run for run in self.complete if _is_evaluated_otherwise(run)]
+        seeds = [run.seed for run in self.runs]
+        return [
+            *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
+            *(["one seed: the interval is over its episodes"] if len(self.by_seed) == 1 else []),
+            *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
+            *(
+                f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, which training would not do"
+                for protocol, runs in grouped(others, lambda run: protocols([run])[0]).items()
+            ),
+            *(f"mixed {found}" for found in mixed("evaluations", protocols(self.complete))),
+            *(f"mixed {found}" for found in mixed("pre-trainings", map(_pretraining, self.runs))),
+            *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),
+        ]
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Return items by the value of a function."""
+    groups: dict[Key, list[Item]] = defaultdict(list)
+    for item in items:
+        groups[key(item)].append(item)
+    return groups
+
+
+def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return names with more than one value. A missing setting has its default if it is an argument, others none."""
+    names = dict.fromkeys(name for one in settings for name in one)
+    shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
+    return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
+
+
+def _target(name: str) -> str:
+    """Name of the setting with the class or function of which a setting is an argument."""
+    return f"{name.rpartition('.')[0]}._target_"
+
+
+def protocols(runs: Sequence[Run]) -> list[str]:
+    """Return how each run was evaluated: its episodes, and settings of the environment that differ between runs."""
+    environments = [run.evaluation.get("environment", {}) for run in runs]
+    telling = varying(environments)
+    return [
+        f"{run.evaluation.get('episodes', 'unknown')} episodes of seed {run.evaluation.get('seed', 'unknown')}"
+        + "".join(f" with {name}={environment[name]}" for name in telling)
+        for run, environment in zip(runs, environments, strict=True)
+    ]
+
+
+def mixed(name: str, values: Iterable[str]) -> list[str]:
+    """Return a line with the values, if they are more than one."""
+    found = sorted(set(values))
+    return [f"{name}: {', '.join(found)}"] if len(found) > 1 else []
+
+
+def _is_evaluated_otherwise(run: Run) -> bool:
+    """Return whether a run's evaluation has other episodes than its configuration says."""
+    names = ("episodes", "seed")
+    planned = [run.settings.get(f"evaluation.{name}") for name in names]
+    held = [run.evaluation.get(name) for name in names]
+    return bool(planned[0]) and None not in (*planned, *held) and planned != held
+
+
+def _pretraining(run: Run) -> str:
+    """Where the networks that a run began with come from, without their seed."""
+    return SEED.sub("", str(run.settings.get("pretrained") or "none"))
+
+
+def _standing(run: Run) -> str:
+    return f"unfinished, {run.progress:.0%} of the steps" if run.state == "unfinished" else run.state
+
+
+def _seeds(seeds: Iterable[int]) -> str:
+    listed = [str(seed) for seed in seeds]
+    return f"seed{'s' if len(listed) > 1 else ''} {', '.join(listed)}"
