@@ -154,6 +154,24 @@ def test_metrics_that_are_gone_are_named_with_the_remedy(killed):
     assert contents(killed) == before
 
 
+def test_an_evaluation_that_is_cut_is_made_anew(tmp_path):
+    folder = experiment.train(configure(tmp_path / "run", SHORT, "evaluation.episodes=1"))
+    whole = (folder / "evaluation.json").read_bytes()
+    (folder / "evaluation.json").write_bytes(whole[:200])
+    experiment.resume(folder)
+    assert (folder / "evaluation.json").read_bytes() == whole
+
+
+def test_a_run_whose_files_are_gone_is_named_with_the_remedy(killed):
+    shutil.rmtree(killed / "checkpoints")
+    with pytest.raises(ValueError, match="holds a run without checkpoints: remove the folder, or give another run_dir"):
+        experiment.train(configure(killed))
+    config = (killed / "config.yaml").read_text()
+    (killed / "config.yaml").write_text(config[: config.index("training:")])
+    with pytest.raises(ValueError, match=r"config.yaml is damaged, it lacks .*training.*: put it back from a copy"):
+        experiment.resume(killed)
+
+
 def test_a_disk_that_fills_up_while_the_configuration_is_written_leaves_no_run(tmp_path, monkeypatch):
     def fill_up(cfg, path):
         path.write_text("seed: 0\ntrain")

@@ -49,7 +49,7 @@ def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
     """
     cfg = cfg or run_config(folder)
     trained = run_folder.frames(checkpoint.find(folder)) >= cfg.training.total_frames
-    return trained and (cfg.evaluation.episodes == 0 or (folder / EVALUATION).is_file())
+    return trained and (cfg.evaluation.episodes == 0 or _is_evaluated(folder))
 
 
 def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
@@ -81,6 +81,8 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
         ValueError: If it holds one, with the settings in which that differs.
     """
     if (folder / CONFIG).exists():
+        if not run_folder.find_all(folder):
+            raise ValueError(f"{folder} holds a run without checkpoints: remove the folder, or give another run_dir")
         changed = changes(folder, config)
         held = f"a run that differs in {', '.join(changed)}: " if changed else ""
         remedy = "" if changed else f"this run already: continue it with {resuming(folder)}, or "
@@ -169,7 +171,21 @@ def _held(folder: Path) -> dict[str, Any]:
     """Return the configuration in a run folder as it is stored."""
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
-    return read_config(folder / CONFIG)
+    config = read_config(folder / CONFIG)
+    if lost := [name for name in ("task", "stage", "training") if name not in config]:
+        raise ValueError(
+            f"{folder / CONFIG} is damaged, it lacks {', '.join(lost)}: put it back from a copy, or train in a new "
+            "folder with stage=pretrain pretrained=<checkpoint file>"
+        )
+    return config
+
+
+def _is_evaluated(folder: Path) -> bool:
+    """Return whether a run folder has an evaluation that can be read; another is made anew."""
+    try:
+        return bool(read_json(folder / EVALUATION))
+    except (OSError, ValueError):
+        return False
 
 
 def _origin(folder: Path) -> dict[str, Any]:
