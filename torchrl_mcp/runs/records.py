@@ -120,7 +120,7 @@ def changed(folder: Path, total_frames: int | None, moves: Mapping[str, str]) ->
     """
     held = _held(folder)
     total = total_frames or held["training"]["total_frames"]
-    if total < (taken := run_folder.frames(checkpoint.find(folder))) and total_frames:
+    if total_frames and total < (taken := run_folder.frames(checkpoint.find(folder))):
         raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
     known = places.outside(held)
     new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
