@@ -112,7 +112,8 @@ def test_without_an_agent_one_checkpoint_is_asked_for(monkeypatch, capsys):
 
 
 def test_an_unknown_setting_of_an_agents_environment_is_refused_without_a_traceback(monkeypatch):
-    assert "task/nope" in refused(monkeypatch, "--agent", "zero", "task=nope")
+    assert refused(monkeypatch, "--agent", "zero", "task=nope").startswith("torchrl-mcp-play: there is no task=nope: ")
+    assert "the nearest are: task" in refused(monkeypatch, "--agent", "zero", "tsk=heading")
 
 
 @pytest.mark.parametrize("words", [["builtin:biped", "--viewer", "web"], ["."], ["--agent", "zero", "--viewer", "web"]])

@@ -18,13 +18,14 @@ def main() -> None:
     from hydra.errors import HydraException
 
     from torchrl_mcp.commands.demo import run
+    from torchrl_mcp.commands.suggestions import answer
 
     preset = "demo_smoke" if arguments.smoke else "demo"
     output = arguments.output or Path("runs", "demo-pretrain" if arguments.pretrain else "demo")
     try:
         run(output, arguments.overrides, preset=preset, pretrain=arguments.pretrain)
     except HydraException as error:
-        sys.exit(f"{PROGRAM}: {error}")
+        sys.exit(f"{PROGRAM}: {answer(error, arguments.overrides, multirun=False)}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
 
