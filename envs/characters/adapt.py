@@ -199,9 +199,10 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
 
 
 def _touching(model: mujoco.MjModel) -> set[int]:
-    """Return the shapes of moving bodies that collide, in general or in pairs that the file names."""
-    paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-    return {*colliding(model), *(geom for geom in paired if model.geom_bodyid[geom] > 0)}
+    """Return the shapes of moving bodies that collide, in general or in a named pair with a shape of the world."""
+    pairs = np.stack([model.pair_geom1, model.pair_geom2], axis=1)
+    moves = model.geom_bodyid[pairs] > 0
+    return {*colliding(model), *pairs[moves & ~moves[:, ::-1]].tolist()}
 
 
 def _possible(inertia: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ LEAST = 0.005
 """Least guessed torque, in weights of the body times the height of its root."""
 
 LEAST_APART = 1e-3
-"""Distance in metres of a body's hinges that is told of."""
+"""Distance in metres of a hinge's anchor from the mean of its body's above which it is told of."""
 
 FILE, GIVEN, GUESSED = "file", "given", "guessed"
 
@@ -163,8 +163,8 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
     motors = [motor(model, joint) for joint in joints]
     own = Motor(*np.max(motors, axis=0).tolist())
     limit, limit_from = _chosen(torque, own.torque, needed.torque)
-    hinges = [motor.torque for motor in motors]
-    limits = _about_axes(model.jnt_axis[joints], hinges) if limit_from == FILE and all(hinges) else [limit] * 3
+    torques = [one.torque for one in motors]
+    limits = _about_axes(model.jnt_axis[joints], torques) if limit_from == FILE and all(torques) else [limit] * 3
     kp, kp_from = _chosen(gain, own.gain, max(limit / LIMIT_ANGLE, needed.gain))
     passive = float(model.dof_damping[dofs].max())
     damping = own.damping if kp_from == FILE and (own.damping or passive) else 0.075 * kp
@@ -195,8 +195,8 @@ def _about_axes(axes: np.ndarray, torques: Sequence[float]) -> list[float]:
 def _remarks(anchors: np.ndarray, limits: Sequence[float], armature: float, steady: float) -> Iterator[str]:
     if len(anchors) > 1:
         yield f"a ball for {len(anchors)} hinges"
-        if (apart := float(np.ptp(anchors, axis=0).max())) > LEAST_APART:
-            yield f"whose anchors, {100 * apart:.2g} cm apart, are one in their middle"
+        if (apart := float(np.linalg.norm(anchors - anchors.mean(0), axis=1).max())) > LEAST_APART:
+            yield f"whose anchors are one, up to {100 * apart:.2g} cm away"
         if min(limits) < max(limits):
             yield f"torques {', '.join(f'{limit:.3g}' for limit in limits)} about x, y, z"
     if 0 < armature < steady:

@@ -84,11 +84,18 @@ def test_a_file_that_cannot_be_read_keeps_no_other_from_being_written(run, tmp_p
     assert {path.name for path in (tmp_path / "clips").iterdir()} == {"first.npz", "last.npz"}
     assert [line.split()[0] for line in output.splitlines()[1:4]] == ["first", "last", "total"]
     first, *others = errors.splitlines()
-    assert first == "torchrl-mcp-motions: 2 files were left out:"
+    assert first == "torchrl-mcp-motions: 2 of 4 files were left out:"
     assert ["cut.txt" in others[0], "empty.bvh" in others[1]] == [True, True]
     status, output, errors = run("inspect", "cut.txt", "last.txt")
     assert (status, output.splitlines()[1].split()[0]) == (2, "last")
-    assert errors.startswith("torchrl-mcp-motions: cut.txt")
+    assert errors.startswith("torchrl-mcp-motions: 1 of 2 files were left out:\ncut.txt")
+
+
+def test_files_that_are_too_short_are_named(run, tmp_path):
+    for name, seconds in (("long", 2.0), ("short", 0.2), ("brief", 0.2)):
+        (tmp_path / f"{name}.txt").write_text(motion(seconds))
+    errors = run("import", "long.txt", "short.txt", "brief.txt", "--rate", 2)[2]
+    assert "\nshort.txt, brief.txt: rate=2.0 leaves less than two frames of 0.2 s" in errors
 
 
 def test_an_argument_that_is_wrong_for_all_files_is_named_once(run, tmp_path):

@@ -128,7 +128,17 @@ def test_the_gate_learns_from_frozen_primitives_as_from_others(mixer, make_actor
         torch.testing.assert_close(free, frozen)
 
 
-@pytest.mark.parametrize("activation", [nn.Tanh(), nn.LeakyReLU(), nn.Softshrink()], ids=lambda one: type(one).__name__)
+def negative(logits):
+    """Weights that are positive at logits of 0, and negative for some."""
+    return logits + 1e-3
+
+
+def infinite(logits):
+    """Weights that are infinite for logits below 0."""
+    return (logits < 0).float() / (logits >= 0).float() + 1
+
+
+@pytest.mark.parametrize("activation", [nn.ReLU(), negative, infinite], ids=["all zero", "negative", "infinite"])
 def test_weights_that_compose_nothing_are_refused_before_training(composite, activation):
     with pytest.raises(ValueError, match="end it with a sigmoid, a softmax or a softplus"):
         composite(gate_activation=activation, distribution_class=MultiplicativeGaussian)

@@ -88,6 +88,15 @@ def test_a_run_that_was_stopped_can_end_where_it_is(killed, whole):
     assert (entry["planned"], entry["total_frames"], entry["after"]) == (640, 512, 512)
 
 
+def test_a_resume_to_the_length_that_was_planned_ends_a_run_of_whole_batches(tmp_path):
+    folder = experiment.train(configure(tmp_path / "run", "training.total_frames=100", "evaluation.episodes=1"))
+    (folder / "evaluation.json").unlink()  # as after a kill during the evaluation
+    experiment.resume(folder, total_frames=100)
+    assert status(folder).state == "done"
+    with pytest.raises(ValueError, match="has taken 128 steps"):
+        experiment.resume(folder, total_frames=90)
+
+
 def test_a_run_holds_its_folder_from_before_the_first_file_to_after_the_last(tmp_path, monkeypatch):
     def seen(function):
         def wrapper(*arguments, **settings):
@@ -164,11 +173,11 @@ def test_an_evaluation_that_is_cut_is_made_anew(tmp_path):
 
 def test_a_run_whose_files_are_gone_is_named_with_the_remedy(killed):
     shutil.rmtree(killed / "checkpoints")
-    with pytest.raises(ValueError, match="holds a run without checkpoints: remove the folder, or give another run_dir"):
+    with pytest.raises(ValueError, match="holds a run without checkpoints: give another run_dir, or remove the folder"):
         experiment.train(configure(killed))
     config = (killed / "config.yaml").read_text()
     (killed / "config.yaml").write_text(config[: config.index("training:")])
-    with pytest.raises(ValueError, match=r"config.yaml is damaged, it lacks .*training.*: put it back from a copy"):
+    with pytest.raises(ValueError, match=r"config.yaml is damaged, without .*training.*: put it back from a copy"):
         experiment.resume(killed)
 
 

@@ -12,31 +12,43 @@ METHODS = ("mcp", "moe", "scratch", "finetune", "hierarchical", "option_critic",
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("task", ["imitation", "heading", "carry", "holdout"])
-def test_the_settings_of_the_library_are_all_used_and_its_arguments_taken(method, task):
-    cfg = compose_run(f"method={method}", f"task={task}", "run_dir=run")
+@pytest.mark.parametrize("others", [[], ["preset=paper", "stage=transfer", "symmetry=augment", "collector=processes"]])
+def test_the_settings_of_the_library_are_all_used_and_its_arguments_taken(method, task, others):
+    cfg = compose_run(f"method={method}", f"task={task}", "run_dir=run", *others)
     require_used(cfg)
-    requirements.require_callable(OmegaConf.to_container(cfg, resolve=True))
+    if not others:
+        requirements.require_callable(OmegaConf.to_container(cfg, resolve=True))
 
 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("+foo=1", "nothing uses the setting foo: correct its name, or leave it out"),
-        ("+training.total_framse=1", "training.total_framse: correct its name .training.total_frames"),
-        ("+gatng.activation=1", "gatng: correct its name .gating"),
+        ("+training.total_framse=1", "training.total_framse: write training.total_frames"),
+        ("+gatng.activation=1", "gatng: write gating"),
         ("+method.num_primitives=4", "method.num_primitives: begin the file of method= with the line '# @package"),
         ("+task.task.name=own", "task.task: begin the file of task= with"),
         ("+preset.seed=1", "preset: begin the file of preset= with"),
+        ("+training.device=cpu", "training.device: write device=..."),
         ("~seed", "the setting seed is missing: leave ~seed out"),
     ],
 )
-def test_a_setting_that_nothing_uses_is_named_with_a_remedy(setting, message):
+def test_a_setting_that_is_misspelt_or_in_a_wrong_group_is_named_with_a_remedy(setting, message):
     with pytest.raises(ValueError, match=message):
         require_used(compose_run(setting))
 
 
-def test_a_setting_of_ones_own_is_used_by_a_reference():
-    require_used(compose_run("+top=3", "+half={of:3}", "+gating.k=${top}", "+gating.l=${half.of}"))
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["+note.x0=1", "+repeat=0"],
+        ["+maks=3", "+gating.k=${maks}"],
+        ["+sede=3", "task.name=${oc.select:sede,1}"],
+        ["+tasks.own=3", "+gating.k=${tasks.own}"],
+        ["step_size=${training}"],
+    ],
+)
+def test_labels_and_settings_of_ones_own_are_allowed(settings):
+    require_used(compose_run(*settings))
 
 
 @pytest.mark.parametrize(
@@ -50,3 +62,13 @@ def test_an_argument_that_a_class_does_not_take_is_named_with_the_nearest(settin
     cfg = compose_run("task=heading", "stage=transfer", "run_dir=run", setting)
     with pytest.raises(ValueError, match=message):
         requirements.require_callable(OmegaConf.to_container(cfg, resolve=True))
+
+
+def test_code_of_others_is_left_to_python():
+    requirements.require_callable({"activation": {"_target_": "torch.sigmoid", "_partial_": True, "gain": 1}})
+
+
+def test_what_both_stages_share_is_not_given_for_one_of_them():
+    cfg = compose_run("task=holdout", "stage=transfer", "+task.transfer.forward_weight=2.0")
+    with pytest.raises(ValueError, match=r"give task\.pretrain\.NAME=VALUE, which holds in both stages"):
+        requirements.require_environment(cfg)

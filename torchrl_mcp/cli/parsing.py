@@ -32,6 +32,8 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
 def explained(program: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
     """Return a decorator of a command's function that ends it with a sentence if it is interrupted or its input is bad.
 
+    In Python's development mode (``-X dev``) it ends with a traceback.
+
     Args:
         program: Name of the command.
     """
@@ -43,7 +45,11 @@ def explained(program: str) -> Callable[[Callable[[], None]], Callable[[], None]
                 main()
             except KeyboardInterrupt:
                 sys.exit(f"\n{program}: interrupted")
+            except yaml.YAMLError as error:
+                sys.exit(f"{program}: settings are no YAML: {' '.join(str(error).split())}")
             except (OSError, ValueError) as error:
+                if sys.flags.dev_mode:
+                    raise
                 sys.exit(f"{program}: {error}")
 
         return run

@@ -38,7 +38,10 @@ SETTINGS = {
     "device=cuda": "networks on a GPU; the physics only with physics=warp",
 }
 
-VALUED = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path", "-c", "--cfg", "-p", "--package")
+VALUED = (
+    *("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path", "-c", "--cfg", "-p", "--package"),
+    *("-i", "--info", "--experimental-rerun"),
+)
 """Options whose value is the next word."""
 
 EXAMPLES = f"""\
@@ -59,7 +62,6 @@ def main() -> None:
     if own := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(own))
     from hydra.errors import HydraException
-    from yaml import YAMLError  # type: ignore[import-untyped]
 
     from torchrl_mcp.commands.suggestions import answer
     from torchrl_mcp.commands.train import run, run_benchmark
@@ -67,7 +69,7 @@ def main() -> None:
 
     if any(word.startswith(("-cd", "--config-dir")) for word in words):
         find_own_modules()
-    sys.argv[1:] = options_first(words)
+    sys.argv[1:] = options_last(words)
     arguments = [word for word in words if word not in ("-m", "--multirun")]
     is_benchmark = any(argument.startswith("benchmark=") for argument in arguments)
     try:
@@ -75,8 +77,6 @@ def main() -> None:
             run_benchmark(arguments) if is_benchmark else run()
     except HydraException as error:
         sys.exit(f"{PROGRAM}: {answer(error, words, multirun=is_benchmark or arguments != words)}")
-    except YAMLError as error:
-        sys.exit(f"{PROGRAM}: a file of settings is no YAML: {' '.join(str(error).split())}")
     except AttributeError:
         if __debug__:
             raise
@@ -85,13 +85,13 @@ def main() -> None:
         )
 
 
-def options_first(words: list[str]) -> list[str]:
-    """Return a command line with its options and their values before the settings, where Hydra's parser needs them."""
+def options_last(words: list[str]) -> list[str]:
+    """Return a command line with its settings before its options, since Hydra's parser takes them in one row."""
     options: list[str] = []
     settings: list[str] = []
     for before, word in pairwise(["", *words]):
         (options if word.startswith("-") or before in VALUED else settings).append(word)
-    return options + settings
+    return settings + options
 
 
 def parser() -> argparse.ArgumentParser:

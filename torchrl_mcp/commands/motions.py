@@ -90,7 +90,7 @@ def import_files(arguments: argparse.Namespace) -> None:
         written |= made
     if written:
         print(f"{_table(written)}\nwritten to {arguments.output}")
-    _raise(failed)
+    _raise(failed, len(arguments.files))
 
 
 def inspect_files(arguments: argparse.Namespace) -> None:
@@ -101,7 +101,7 @@ def inspect_files(arguments: argparse.Namespace) -> None:
         print(_table(motions))
         if arguments.strides:
             print(f"\n{_strides(motions)}")
-    _raise(failed)
+    _raise(failed, len(arguments.files))
 
 
 def render_files(arguments: argparse.Namespace) -> None:
@@ -113,7 +113,7 @@ def render_files(arguments: argparse.Namespace) -> None:
         save_picture(contact_sheet(clip), sheet)
         save_film(clip, film, seconds=arguments.seconds)
         print(f"{sheet}\n{film}")
-    _raise(failed)
+    _raise(failed, len(arguments.files))
 
 
 def build_paper_corpus(arguments: argparse.Namespace) -> None:
@@ -163,17 +163,27 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
                 joints=arguments.joints.split(",") if arguments.joints else None,
                 bodies=bodies,
             )
-        except (BadZipFile, OSError, RuntimeError, ValueError) as error:
+        except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
             failed[path] = error
         else:
             yield path.stem, motion
 
 
-def _raise(failed: Failures) -> None:
-    """Raise an error with those of all files, if there are any."""
-    if messages := list(dict.fromkeys(map(str, failed.values()))):
-        left = f"{len(failed)} files were left out:\n" if len(messages) > 1 else ""
-        raise ValueError(left + "\n".join(messages))
+def _raise(failed: Failures, number: int) -> None:
+    """Raise an error that names each file that could not be read, if there are any.
+
+    Args:
+        failed: The errors of these files.
+        number: Number of all files.
+    """
+    messages: dict[str, list[str]] = {}
+    for path, error in failed.items():
+        messages.setdefault(str(error), []).append(str(path))
+    if len(messages) == 1 and len(failed) == number:
+        raise ValueError(*messages)
+    if messages:
+        lines = (text if paths[0] in text else f"{', '.join(paths)}: {text}" for text, paths in messages.items())
+        raise ValueError(f"{len(failed)} of {number} files were left out:\n" + "\n".join(lines))
 
 
 def _require_no_recordings(names: Iterable[str], folder: Path, recordings: Sequence[Path] = ()) -> None:

@@ -70,13 +70,18 @@ def _explained(cfg: DictConfig) -> Iterator[None]:
     except (ValueError, FloatingPointError) as error:
         sys.exit(f"{PROGRAM}: {error}")
     except HydraException as error:
-        cause = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ else []
-        place = f" ({cause[-1].filename}, line {cause[-1].lineno})" if cause else ""
-        sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}{place}")
+        sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}{_place(error)}")
     except OSError as error:
         sys.exit(f"{PROGRAM}: {error}. {_what_is_safe(cfg)}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted. {_what_is_safe(cfg)}")
+
+
+def _place(error: HydraException) -> str:
+    """Return the last line of code, outside of installed packages, of the error that Hydra tells of."""
+    frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ else []
+    own = [frame for frame in frames if "site-packages" not in frame.filename]
+    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
 
 
 @contextmanager

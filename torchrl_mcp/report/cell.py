@@ -175,7 +175,7 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names with more than one value. A missing setting has its default if it is an argument, others none."""
+    """Return names with more than one value; one that is missing counts, as the default, if it is an argument."""
     names = dict.fromkeys(name for one in settings for name in one)
     shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
     return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]

@@ -98,17 +98,17 @@ def _train(plan: Plan) -> Path:
 
 def _resume(folder: Path, device: str | None, total_frames: int | None, moves: Mapping[str, str]) -> Path:
     """Continue a run, whose record changes once its state is restored."""
-    config = records.changed(folder, total_frames, moves)
+    config = records.replanned(folder, total_frames, moves)
     cfg = records.located(config, folder)
     if is_complete(folder) and is_complete(folder, cfg):
-        records.change(folder, config)
+        records.store(folder, config)
         return folder
     require_resumable(config)
     cfg.device = device or cfg.device
     require_all(cfg)
     print(f"{folder} goes on{records.elsewhere(folder, cfg)}", flush=True)
     trainer = _restored(cfg, folder)
-    records.change(folder, config)
+    records.store(folder, config)
     (folder / EVALUATION).unlink(missing_ok=True)
     return _finish(trainer, cfg, folder)
 

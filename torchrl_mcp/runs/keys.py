@@ -1,4 +1,4 @@
-"""Names of settings: whether the library, or another setting, uses each."""
+"""Names of settings: whether one that nothing uses is a mistake."""
 
 import difflib
 import re
@@ -14,29 +14,36 @@ from omegaconf import DictConfig, OmegaConf
 FOLDER = Path(str(files("torchrl_mcp.conf")))
 
 GROUPS = ("method", "task", "training", "step_size", "evaluation", "transfer")
-"""Groups whose settings are checked one by one: those that are no arguments of a class and no choice of ``conf``."""
+"""Groups whose settings are compared one by one: those that are no arguments of a class."""
 
-HEADER = re.compile(r"^# @package _global_$", re.MULTILINE)
-REFERENCE = re.compile(r"\$\{([\w.]+)")
+HEADER = "# @package _global_"
+PARTS = {"transport": "task"}
+"""Files of ``conf`` that others include, and the group of their settings."""
+
+ALIKE = 0.8
+"""Similarity to a known name, from 0 to 1, above which an unknown one is taken for a mistake."""
 
 
 def require_used(cfg: DictConfig) -> None:
-    """Check that every setting of a run is one of the library's, or that another refers to it, and that none is lost.
+    """Check that no setting of a run is a known one misspelt, or in a wrong group.
+
+    Other settings that nothing uses are allowed, as labels of runs.
 
     Args:
         cfg: The configuration, with its references.
 
     Raises:
-        ValueError: If one is not, with the nearest known settings.
+        ValueError: If one is, with its remedy, or a setting that all runs have is missing.
     """
     if lost := [name for name in _content(FOLDER / "train.yaml") if name not in ("defaults", "hydra", *cfg)]:
         raise ValueError(f"the setting {lost[0]} is missing: leave ~{lost[0]} out")
     config: Any = OmegaConf.to_container(cfg)
-    names = [*config, *(f"{group}.{key}" for group in GROUPS for key in config[group])]
-    used = known() | set(_referenced(config))
-    wrong = [name for name in names if name not in used]
-    lines = [f"nothing uses the setting {name}: {_remedy(name)}" for name in wrong]
-    if lines:
+    groups = {group: config[group] for group in GROUPS if isinstance(config[group], Mapping)}
+    names = [*config, *(f"{group}.{key}" for group, settings in groups.items() for key in settings)]
+    own = set(_words(config)) - known()
+    unused = [name for name in names if name not in known() and name.rpartition(".")[2] not in own]
+    remedies = {name: _remedy(name) for name in unused}
+    if lines := [f"nothing uses the setting {name}: {remedy}" for name, remedy in remedies.items() if remedy]:
         raise ValueError("\n".join(lines))
 
 
@@ -46,10 +53,8 @@ def known() -> frozenset[str]:
     names: set[str] = set()
     for path in FOLDER.rglob("*.yaml"):
         content = _content(path)
-        if path.stem == "transport":  # a part of two tasks
-            content = {"task": content}
-        elif path.parent != FOLDER and not HEADER.search(path.read_text(encoding="utf-8")):
-            content = {path.parent.name: content}
+        if path.stem in PARTS or not (path.parent == FOLDER or HEADER in path.read_text(encoding="utf-8")):
+            content = {PARTS.get(path.stem, path.parent.name): content}
         names |= {*content, *(f"{group}.{key}" for group in GROUPS for key in content.get(group, ()))}
     return frozenset(names)
 
@@ -58,20 +63,21 @@ def _content(path: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
 
 
-def _referenced(value: Any) -> Iterator[str]:
-    """Yield the settings that references in a configuration name, with the groups that they are in."""
+def _words(value: Any) -> Iterator[str]:
+    """Yield all words of texts with references, which may be of any form."""
     if isinstance(value, Mapping | list):
         for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _referenced(item)
-    elif isinstance(value, str):
-        for name in REFERENCE.findall(value):
-            parts = name.split(".")
-            yield from (".".join(parts[:end]) for end in range(1, len(parts) + 1))
+            yield from _words(item)
+    elif isinstance(value, str) and "${" in value:
+        yield from re.findall(r"[\w-]+", value)
 
 
-def _remedy(name: str) -> str:
+def _remedy(name: str) -> str | None:
+    """Return what to write in place of a setting that nothing uses, None if it resembles no known one."""
     group, _, key = name.rpartition(".")
-    if key in known() or (FOLDER / name).is_dir():
-        return f"begin the file of {group or name}= with the line '# @package _global_', or leave {name} out"
-    near = difflib.get_close_matches(name, known(), n=3, cutoff=0.6)
-    return f"correct its name{f' ({chr(32).join(near)})' if near else ''}, or leave it out"
+    if (FOLDER / (group or name)).is_dir() and (not group or key in known()):
+        return f"begin the file of {group or name}= with the line '{HEADER}', or leave {name} out"
+    if key in known() and group:
+        return f"write {key}=..."
+    near = difflib.get_close_matches(name, known(), n=1, cutoff=ALIKE)
+    return f"write {near[0]}" if near else None

@@ -44,7 +44,7 @@ def provenance(device: str, precision: Precision, inputs: Mapping[str, str]) -> 
 
 
 def continuation(origin: Mapping[str, Any], planned: int, total: int, frames: int) -> dict[str, Any]:
-    """Return the provenance of a run that becomes longer than planned.
+    """Return the provenance of a run whose length is no longer the planned one.
 
     Args:
         origin: The provenance so far.

@@ -28,7 +28,7 @@ def run_config(folder: Path) -> DictConfig:
 
 
 def located(config: Mapping[str, Any], folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder`` from a stored one, as :func:`changed` returns.
+    """Return the configuration of the run in ``folder`` from a stored one, as :func:`replanned` returns.
 
     Raises:
         ValueError: If it is of another version of the library.
@@ -82,7 +82,7 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
     """
     if (folder / CONFIG).exists():
         if not run_folder.find_all(folder):
-            raise ValueError(f"{folder} holds a run without checkpoints: remove the folder, or give another run_dir")
+            raise ValueError(f"{folder} holds a run without checkpoints: give another run_dir, or remove the folder")
         changed = changes(folder, config)
         held = f"a run that differs in {', '.join(changed)}: " if changed else ""
         remedy = "" if changed else f"this run already: continue it with {resuming(folder)}, or "
@@ -107,7 +107,7 @@ def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None
     _write_config(config, folder)
 
 
-def changed(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> dict[str, Any]:
+def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> dict[str, Any]:
     """Return the stored configuration of a run with another length, and other places of files outside its folder.
 
     Args:
@@ -116,19 +116,20 @@ def changed(folder: Path, total_frames: int | None, moves: Mapping[str, str]) ->
         moves: New places, by the names of their settings; names that the run lacks are ignored.
 
     Raises:
-        ValueError: If the folder holds no run, or the run has taken more steps.
+        ValueError: If the folder holds no run, or the run has taken more steps than another length.
     """
     held = _held(folder)
-    total = total_frames or held["training"]["total_frames"]
-    if total_frames and total < (taken := run_folder.frames(checkpoint.find(folder))):
+    planned = held["training"]["total_frames"]
+    total = total_frames or planned
+    if total != planned and total < (taken := run_folder.frames(checkpoint.find(folder))):
         raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
     known = places.outside(held)
     new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
     return {**places.moved(held, new), "training": {**held["training"], "total_frames": total}}
 
 
-def change(folder: Path, config: Mapping[str, Any]) -> None:
-    """Store the configuration of a run as :func:`changed`, and its provenance."""
+def store(folder: Path, config: Mapping[str, Any]) -> None:
+    """Store a configuration of a run as :func:`replanned`, and its provenance."""
     held = _held(folder)
     planned, total = (one["training"]["total_frames"] for one in (held, config))
     if config != held:
@@ -174,8 +175,7 @@ def _held(folder: Path) -> dict[str, Any]:
     config = read_config(folder / CONFIG)
     if lost := [name for name in ("task", "stage", "training") if name not in config]:
         raise ValueError(
-            f"{folder / CONFIG} is damaged, it lacks {', '.join(lost)}: put it back from a copy, or train in a new "
-            "folder with stage=pretrain pretrained=<checkpoint file>"
+            f"{folder / CONFIG} is damaged, without {', '.join(lost)}: put it back from a copy, or give another run_dir"
         )
     return config
 

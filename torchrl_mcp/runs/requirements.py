@@ -53,6 +53,11 @@ def require_environment(cfg: DictConfig) -> None:
         )
     # Import everything that is named: importing a user's motions may register the user's character.
     names = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
+    if "_target_" not in cfg.task[cfg.stage.name]:
+        raise ValueError(
+            f"task.{cfg.stage.name} of task={task} has no settings of its own: give task.pretrain.NAME=VALUE, which "
+            "holds in both stages"
+        )
     environment, *_ = [pkgutil.resolve_name(name) for name in names]
     able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
@@ -61,7 +66,7 @@ def require_environment(cfg: DictConfig) -> None:
 
 
 def require_callable(config: Any, path: str = "") -> None:
-    """Check that the classes and functions in a configuration take the arguments that it gives them.
+    """Check that the library's classes and functions in a configuration take the arguments that it gives them.
 
     Args:
         config: The configuration, without references.
@@ -70,13 +75,13 @@ def require_callable(config: Any, path: str = "") -> None:
     Raises:
         ValueError: If one does not, with the nearest that it takes.
     """
-    if isinstance(config, Mapping):
-        name = config.get("_target_")
-        if isinstance(name, str) and _exists(name) and not any(map(_is_open, (taken := arguments(name)).values())):
-            for key in config:
-                if key not in taken and not str(key).startswith("_"):
-                    near = difflib.get_close_matches(str(key), taken, cutoff=0.5) or sorted(taken)
-                    raise ValueError(f"{path}.{key} is no argument of {name}; the nearest are: {', '.join(near)}")
+    name = config.get("_target_") if isinstance(config, Mapping) else None
+    if isinstance(name, str) and name.startswith("torchrl_mcp.") and _exists(name):
+        taken = arguments(name)
+        unknown = [str(key) for key in config if key not in taken and not str(key).startswith("_")]
+        if unknown and not any(map(_is_open, taken.values())):
+            near = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
+            raise ValueError(f"{path}.{unknown[0]} is no argument of {name}; the nearest are: {', '.join(near)}")
     items = config.items() if isinstance(config, Mapping) else enumerate(config) if isinstance(config, list) else ()
     for key, value in items:
         require_callable(value, f"{path}.{key}" if path else str(key))
@@ -170,7 +175,7 @@ def require_arguments(name: str, given: Collection[str]) -> None:
     taken = arguments(name)
     if unknown := [argument for argument in given if argument not in taken]:
         tasks_own = {*inspect.signature(CharacterEnv.__init__).parameters} - {"max_episode_steps"}
-        listed = sorted({*taken} - tasks_own - {"character"})
+        listed = sorted({*taken} - tasks_own - {"kwargs", "character"})
         raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 

@@ -136,7 +136,7 @@ def test_every_hinge_of_several_keeps_its_torque_and_what_is_joined_is_told():
     assert model.joint("right_thigh").pos.tolist() == [0.01, 0, 0]
     assert model.body_gravcomp[model.body("right_thigh").id] == 0.5
     assert body.drives["right_thigh"].remark == (
-        "a ball for 2 hinges, whose anchors, 2 cm apart, are one in their middle, torques 60, 20, 20 about x, y, z"
+        "a ball for 2 hinges, whose anchors are one, up to 1 cm away, torques 60, 20, 20 about x, y, z"
     )
 
 
