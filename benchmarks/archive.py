@@ -185,7 +185,8 @@ def average(values: Sequence[float]) -> float:
 
 def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
     """Yield the facts about a run with its results, for each mode."""
-    machine, command = run.provenance.get("machine", {}), run.provenance.get("command", [])
+    machine = run.provenance.get("machine", {})
+    commands = [run.provenance.get("command", []), *(entry["command"] for entry in run.provenance.get("extended", []))]
     for mode in MODES:
         numbers = run.evaluation[mode]
         yield {
@@ -203,5 +204,5 @@ def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
             "preset": run.preset,
             "commit": run.commit,
             **{key: machine.get(key, "") for key in ("processor", "cores", "torch", "mujoco")},
-            "command": shlex.join(command),
+            "command": " && ".join(map(shlex.join, commands)),
         }

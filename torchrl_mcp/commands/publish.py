@@ -107,7 +107,8 @@ def _contents(path: Path, cfg: DictConfig) -> str:
     if not (shared := checkpoint.shared(path)):
         return "the whole policy"
     origin = builtin(cfg.method.name, cfg.character.name)
-    return f"all but {' and '.join(shared)}, which `{origin.name}` has"
+    names = " and ".join(shared).replace("_", " ")
+    return f"all but the {names} of `{origin.name}`"
 
 
 def _returns(numbers: Mapping[str, Any]) -> str:
