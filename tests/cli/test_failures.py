@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -60,6 +61,13 @@ def test_what_comes_from_outside_ends_in_a_sentence_with_what_is_safe_and_how_to
 )
 def test_a_run_that_cannot_go_on_says_why(cfg, monkeypatch, failure, sentence):
     assert sentence in said(cfg, monkeypatch, failure)
+
+
+def test_in_development_mode_the_command_ends_with_a_traceback():
+    words = [sys.executable, "-X", "dev", "-W", "ignore", "-m", "torchrl_mcp.cli.evaluate", "nowhere"]
+    plain = subprocess.run([*words[:1], *words[5:]], capture_output=True, text=True)
+    assert "Traceback" not in plain.stderr
+    assert "Traceback" in subprocess.run(words, capture_output=True, text=True).stderr
 
 
 @pytest.mark.parametrize(

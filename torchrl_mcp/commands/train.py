@@ -64,7 +64,10 @@ def train(cfg: DictConfig) -> float | None:
 
 @contextmanager
 def _explained(cfg: DictConfig) -> Iterator[None]:
-    """End the command with a sentence if its run fails or is interrupted."""
+    """End the command with a sentence if its run fails or is interrupted, in development mode with a traceback."""
+    if sys.flags.dev_mode:
+        yield
+        return
     try:
         yield
     except (ValueError, FloatingPointError) as error:

@@ -5,7 +5,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_mcp.objectives.advantages import normalised, reward_scale
+from torchrl_mcp.objectives.advantages import normalised, reward_scale, upon_arrival
 
 
 class SemiMarkovAdvantages:
@@ -57,27 +57,24 @@ class SemiMarkovAdvantages:
                 f"no choice was made in {batch.shape[1]} steps: training.frames_per_batch / training.num_envs must be "
                 "at least the steps that a choice lasts"
             )
-        value = torch.zeros(batch.shape, device=begins.device)
+        value = torch.zeros(*batch.shape, 1, device=begins.device)
         value[begins] = self._values(batch[begins])
         target = self._targets(batch, value)
 
         choices = batch[begins]
-        choices["advantage"] = normalised((target - value)[begins], self.clip).unsqueeze(-1)
-        choices["value_target"] = target[begins].unsqueeze(-1)
-        choices["state_value"] = value[begins].unsqueeze(-1)
+        choices["advantage"] = normalised((target - value)[begins], self.clip)
+        choices["value_target"] = target[begins]
+        choices["state_value"] = value[begins]
         return choices
 
     def _targets(self, batch: TensorDictBase, value: Tensor) -> Tensor:
-        r"""TD(:math:`\lambda`) returns from every step, ``(N, T)``, given the values where choices begin."""
-        terminated, truncated = (batch["next", key].squeeze(-1) for key in ("terminated", "truncated"))
-        stops = terminated | truncated
-        stops[:, -1] = True
-        cut = stops & ~terminated
-        next_value = value.roll(-1, dims=1).masked_fill(terminated, 0.0)
-        next_value[cut] = self._values(batch["next"][cut])
-        lmbda = self.lmbda * (~stops).float()
-        ends = stops | batch["begins"].roll(-1, dims=1)
-        reward = self.reward_scale * batch["next", "reward"].squeeze(-1)
+        r"""TD(:math:`\lambda`) returns from every step, given the values where choices begin, ``(N, T, 1)`` each."""
+        terminated, done = batch["next", "terminated"], batch["next", "done"].clone()
+        done[:, -1] = True
+        next_value = upon_arrival(value, batch, self._values).masked_fill(terminated, 0.0)
+        lmbda = self.lmbda * (~done).float()
+        ends = done | batch["begins"].roll(-1, dims=1).unsqueeze(-1)
+        reward = self.reward_scale * batch["next", "reward"]
         target = torch.empty_like(value)
         later = torch.zeros_like(value[:, 0])
         for t in reversed(range(batch.shape[1])):
@@ -86,4 +83,4 @@ class SemiMarkovAdvantages:
         return target
 
     def _values(self, states: TensorDictBase) -> Tensor:
-        return self.critic(states.select("observation", "goal"))["state_value"].squeeze(-1).float()
+        return self.critic(states.select("observation", "goal"))["state_value"].float()
