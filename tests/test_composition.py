@@ -4,10 +4,10 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.requirements import require_environment
 
 CONF = Path(conf.__file__).parent
@@ -26,8 +26,7 @@ TASKS = {  # characters that can do it, the one it takes by default, and its sta
 
 
 def composed(*overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", [*overrides, "run_dir=never"])
+    return compose_run(*overrides, "run_dir=never")
 
 
 def test_there_are_no_others():

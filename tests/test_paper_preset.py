@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
 from torchrl_mcp import conf
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 
 CHARACTERS = ("biped", "humanoid", "trex")
 
@@ -87,8 +87,7 @@ METHODS = sorted({path.stem for path in (Path(conf.__file__).parent / "method").
 def configure(method, stage, *overrides):
     task = {"pretrain": "imitation", "transfer": "heading"}[stage]
     settings = ["preset=paper", f"method={method}", f"stage={stage}", f"task={task}", "num_threads=1", *overrides]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", settings)
+    return compose_run(*settings)
 
 
 @pytest.fixture(scope="module", params=sorted(LAYERS), ids="-".join)
@@ -96,7 +95,7 @@ def built(request, tmp_path_factory):
     """A method, a stage, and the trainer of the biped that the preset builds for them."""
     method, stage = request.param
     folder = tmp_path_factory.mktemp("run")
-    cfg = configure(method, stage, f"run_dir={folder}")
+    cfg = configure(method, stage, f"run_dir={folder}", "training.num_envs=4")  # of 64, which no table has
     source = build.make_source(cfg)
     return method, stage, build.make_trainer(cfg, build.make_agent(cfg, source.env), source, folder)
 

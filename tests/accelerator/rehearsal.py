@@ -14,13 +14,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from hydra import compose, initialize_config_module
 from stand_in import NAME, Accelerator, PretendTensor, register
 from torch.utils._python_dispatch import _disable_current_modes
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
 
 from torchrl_mcp.runs import experiment, policies
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.trainer import Trainer
@@ -84,8 +84,7 @@ def plant():
 def train(folder, method, *overrides):
     """Train for one iteration of pre-training or two of transfer."""
     settings = [f"method={method}", f"run_dir={folder}", *SETTINGS, *overrides]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", settings)
+    cfg = compose_run(*settings)
     iterations = 2 if cfg.stage.name == "transfer" else 1
     cfg.training.total_frames = iterations * cfg.training.frames_per_batch * cfg.get("batch_factor", 1)
     return experiment.train(cfg)

@@ -3,20 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 
 from torchrl_mcp.analysis.checkpoints import untrained
 from torchrl_mcp.analysis.walks import Walk
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 
 STRIDES, PERIOD = 4, 30
 
 
 def test_untrained_networks_see_states_through_the_normalisers_of_the_trained():
     """So the units of the states make no difference."""
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", overrides=["preset=smoke", "task=imitation", "character=biped"])
+    cfg = compose_run("preset=smoke", "task=imitation", "character=biped")
     env = build.make_env(cfg, num_envs=1, seed=0)
     phases = np.arange(STRIDES * PERIOD) % PERIOD / PERIOD
     standing = np.stack([phases < 0.6, (phases + 0.5) % 1 < 0.6], -1)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
 from torchrl_mcp.cli import figures
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.publish import publish
 
 ANT = ["task=holdout", "task.pretrain.max_episode_steps=6"]
@@ -30,8 +30,7 @@ def save(folder, *overrides):
         "training.total_frames=128",
         *overrides,
     ]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", overrides=settings)
+    cfg = compose_run(*settings)
     agent = build.make_agent(cfg, build.make_env(cfg, num_envs=1, seed=0))
     config = OmegaConf.to_container(cfg, resolve=True)
     publish(agent.parts, config, folder / "checkpoints" / "checkpoint-000000000128.torchrl")

@@ -9,7 +9,6 @@ from zipfile import ZipFile
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.envs.utils import step_mdp
 
@@ -17,6 +16,7 @@ from torchrl_mcp.cli import evaluate, play, publish
 from torchrl_mcp.commands import publish as publishing
 from torchrl_mcp.evaluation import rollout
 from torchrl_mcp.runs import builtin, experiment, policies
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.publish import publish as write_published
 from torchrl_mcp.training import checkpoint
 
@@ -50,8 +50,7 @@ def run(tmp_path_factory):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
     settings += ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
     settings += ["width=1", "gating.network.width=0.1", "critic.width=0.1"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return experiment.train(compose("train", [*settings, "task.evaluation.max_episode_steps=30"]))
+    return experiment.train(compose_run(*settings, "task.evaluation.max_episode_steps=30"))
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +96,7 @@ def test_a_gate_that_began_as_another_gate_leaves_out_the_same_parts(run, tmp_pa
     settings += ["method=mcp", "task=location", "stage=transfer", f"pretrained={run}", "width=1"]
     settings += ["gating.network.width=0.1", "critic.width=0.1"]
     settings += ["transfer.keep=[primitives,observation_normaliser,gating]"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        experiment.train(compose("train", settings))
+    experiment.train(compose_run(*settings))
     gate = tmp_path / "gate.torchrl"
     policies.publish_run(tmp_path / "next", gate)
     assert set(checkpoint.shared(gate)) == {"primitives", "observation_normaliser"}
@@ -110,8 +108,7 @@ def test_training_begins_with_a_built_in_gate_and_the_primitives_under_it(tmp_pa
     settings += ["method=mcp", "task=location", "character=biped", "stage=transfer", "pretrained=builtin:biped-heading"]
     settings += ["transfer.keep=[primitives,observation_normaliser,gating]", "width=0.5"]
     settings += ["transfer.freeze=[primitives,observation_normaliser,gating]", "training.total_frames=128"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        experiment.train(compose("train", settings))
+    experiment.train(compose_run(*settings))
     _, trained, _ = policies.restore(tmp_path, num_envs=1, seed=0)
     _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "heading"), num_envs=1, seed=0)
     for part in ("primitives", "observation_normaliser", "gating"):
@@ -135,8 +132,7 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     ]
     settings += ["method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
     settings += [f"transfer.keep=[{known}]", f"transfer.freeze=[{known}]", "training.total_frames=128"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        experiment.train(compose("train", [*settings, "waypoint=true", "transfer.goal_entry=waypoint"]))
+    experiment.train(compose_run(*settings, "waypoint=true", "transfer.goal_entry=waypoint"))
     _, carry, env = policies.restore(tmp_path, num_envs=20, seed=0)
     _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "location"), num_envs=1, seed=0)
     scene = env.reset()
@@ -149,8 +145,7 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
 def test_an_entry_that_the_goal_lacks_is_refused(task, known, tmp_path):
     settings = ["preset=smoke", "logger=none", f"run_dir={tmp_path}", "method=mcp", f"task={task}", "character=biped"]
     settings += ["stage=transfer", "pretrained=builtin", "transfer.goal_entry=place"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", settings)
+    cfg = compose_run(*settings)
     with pytest.raises(ValueError, match=f"transfer.goal_entry=place is no entry of the task's goal, which {known}"):
         experiment.train(cfg)
 
@@ -188,8 +183,7 @@ def test_the_card_compares_no_range_of_speeds_with_the_paper(tmp_path):
     numbers = {"episodes": 2, "seed": 0, "deterministic": values, "stochastic": values}
     (tmp_path / "gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
     for range_of_speeds, said in (([], "the paper: 0.970 ± 0.003"), (["+task.transfer.speed=[0.0,1.0]"], "no return")):
-        with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-            cfg = compose("train", ["task=heading", "character=humanoid", "stage=transfer", *range_of_speeds])
+        cfg = compose_run("task=heading", "character=humanoid", "stage=transfer", *range_of_speeds)
         card = publishing.model_card(tmp_path / "gate.torchrl", cfg, numbers, origin={}, steps=1, limits=[])
         assert said in card
 
@@ -203,9 +197,8 @@ def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(mon
         f"pretrained={tmp_path / 'pretraining'}",
         f"run_dir={tmp_path / 'run'}",
     ]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        for words in (pretraining, transfer):
-            run = experiment.train(compose("train", [*settings, *words]))
+    for words in (pretraining, transfer):
+        run = experiment.train(compose_run(*settings, *words))
     monkeypatch.setattr(builtin, "FOLDER", tmp_path)
     policies.publish_run(tmp_path / "pretraining", tmp_path / "mcp-biped.torchrl")
     policies.publish_run(run, tmp_path / "gate.torchrl")

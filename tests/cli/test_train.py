@@ -144,6 +144,7 @@ def test_what_hydra_cannot_compose_is_answered_in_a_line(command, tmp_path, argu
     assert outcome.returncode
     assert answer in outcome.stderr
     assert len(outcome.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_options_may_follow_settings_and_a_damaged_file_is_named(command, tmp_path):

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from tensordict import TensorDict
 from torch import nn
@@ -11,6 +10,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.mcp import composite_actor
+from torchrl_mcp.runs.configuration import compose_run
 
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
 ACTIVATIONS = {"sigmoid": nn.Sigmoid(), "softmax": nn.Softmax(dim=-1)}
@@ -29,8 +29,7 @@ def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives
 
 @pytest.mark.parametrize("method", ["mcp", "moe"])
 def test_what_a_composite_plays_in_one_state_varies_by_the_standard_deviation_asked_for(method):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [f"method={method}", "task=imitation"])
+    cfg = compose_run(f"method={method}", "task=imitation")
     torch.manual_seed(1)
     parts = instantiate(cfg.parts)(Sizes(105, 208, 17))
     actor = instantiate(cfg.actor)(parts)

@@ -2,19 +2,14 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from torch import nn
 
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.modules.primitives import BatchedLinear
+from torchrl_mcp.runs.configuration import compose_run
 
 APPENDIX_E = ("width=1.0", "learned_std=false")  # the default preset has half the width and learned noise
-
-
-def configure(*overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", list(overrides))
 
 
 @pytest.mark.parametrize("num_primitives", [1, 4, 8, 32])
@@ -23,7 +18,7 @@ def configure(*overrides):
 def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_for(
     num_primitives, mixer, activation, states, sizes
 ):
-    cfg = configure(f"mixer={mixer}", f"gating={activation}", f"num_primitives={num_primitives}")
+    cfg = compose_run(f"mixer={mixer}", f"gating={activation}", f"num_primitives={num_primitives}")
     torch.manual_seed(0)
     parts, td = instantiate(cfg.parts)(sizes), states(200)
     parts["observation_normaliser"].update(td["observation"])
@@ -52,7 +47,7 @@ def test_as_configured_the_composite_starts_near_the_standard_deviation_asked_fo
 )
 def test_the_configuration_builds_appendix_e_for_the_biped(method, stage, parameters):
     task, goal_dim = {"pretrain": ("imitation", 208), "transfer": ("heading", 2)}[stage]
-    cfg = configure(f"method={method}", f"stage={stage}", f"task={task}", "character=biped", *APPENDIX_E)
+    cfg = compose_run(f"method={method}", f"stage={stage}", f"task={task}", "character=biped", *APPENDIX_E)
     parts = instantiate(cfg.parts)(Sizes(105, goal_dim, 17))
     instantiate(cfg.critic)(parts, Sizes(105, goal_dim, 17))
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
@@ -74,7 +69,7 @@ COUNTS = {
 
 @pytest.mark.parametrize(("method", "stage"), COUNTS)
 def test_parameters_are_as_many_as_the_paper_s_layers_have(method, stage):
-    cfg = configure(f"method={method}", f"stage={stage}", "character=biped", "task=heading", *APPENDIX_E)
+    cfg = compose_run(f"method={method}", f"stage={stage}", "character=biped", "task=heading", *APPENDIX_E)
     parts = instantiate(cfg.parts)(Sizes(105, 2, 17))
     counts = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
     assert {name: count for name, count in counts.items() if count} == COUNTS[method, stage]
@@ -87,7 +82,7 @@ def test_parameters_are_as_many_as_the_paper_s_layers_have(method, stage):
 def test_width_scales_every_hidden_layer_of_every_network(method, stage):
     hidden = {}
     for width in (1.0, 0.5):
-        cfg = configure(f"method={method}", f"stage={stage}", "task=heading", "character=biped", f"width={width}")
+        cfg = compose_run(f"method={method}", f"stage={stage}", "task=heading", "character=biped", f"width={width}")
         parts = instantiate(cfg.parts)(Sizes(105, 2, 17))
         instantiate(cfg.critic)(parts, Sizes(105, 2, 17))
         linear = [layer for layer in parts.modules() if isinstance(layer, (nn.Linear, BatchedLinear))]
@@ -100,4 +95,4 @@ def test_width_scales_every_hidden_layer_of_every_network(method, stage):
 
 def test_a_width_without_units_is_refused():
     with pytest.raises(ValueError, match="width=0"):
-        instantiate(configure("width=0.0").parts)(Sizes(105, 2, 17))
+        instantiate(compose_run("width=0.0").parts)(Sizes(105, 2, 17))

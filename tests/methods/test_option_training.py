@@ -4,9 +4,9 @@ import csv
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
 from torchrl_mcp.runs import build, experiment, policies
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.trainer import Trainer
 
 TIMES = ("seconds", "time/")
@@ -24,8 +24,7 @@ SMALL = {
 def configure(folder, method, *overrides):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "checkpoint_interval=1"]
     settings += [f"run_dir={folder}", f"method={method}", *SMALL[method]]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", overrides=[*settings, *overrides])
+    return compose_run(*settings, *overrides)
 
 
 def rows(folder):
@@ -87,17 +86,6 @@ def test_an_interrupted_run_continues_with_the_option_that_was_held(tmp_path, mo
         assert torch.equal(value, expected[name]), name
 
 
-def test_transfer_of_options_trains_their_values_alone(tmp_path, pretrained):
-    folder = tmp_path / "run"
-    settings = ["stage=transfer", f"pretrained={pretrained['option_critic']}", "training.total_frames=256"]
-    experiment.train(configure(folder, "option_critic", *settings))
-    before, after = final_parts(pretrained["option_critic"]), final_parts(folder)
-    kept = ("options", "terminations", "observation_normaliser")
-    for name in before:
-        changed = name.startswith("critic") or name in ("goal_normaliser.mean", "goal_normaliser.variance")
-        assert torch.equal(before[name], after[name]) == (name.startswith(kept) and not changed), name
-
-
 def test_transfer_with_frozen_terminations_trains_options_and_values(tmp_path, pretrained):
     folder = tmp_path / "run"
     settings = ["stage=transfer", f"pretrained={pretrained['option_critic']}", "training.total_frames=256"]
@@ -141,11 +129,10 @@ def test_the_gate_learns_from_choices_and_environment_steps_are_counted(tmp_path
     assert float(row["options/duration"]) <= 30
 
 
-@pytest.mark.parametrize(("autocast", "tolerance"), [("false", 1e-5), ("true", 2e-3)])
-def test_collection_and_loss_of_options_agree_before_the_first_update(tmp_path, autocast, tolerance):
+def test_collection_and_loss_of_options_agree_before_the_first_update_in_bfloat16(tmp_path):
     folder = tmp_path / "run"
     one_step = ["training.num_epochs=1", "training.minibatch_size=128", "training.total_frames=128"]
-    experiment.train(configure(folder, "option_critic", f"autocast={autocast}", *one_step))
+    experiment.train(configure(folder, "option_critic", "autocast=true", *one_step))
     (first,) = rows(folder)
-    assert abs(float(first["loss/mean_ratio"]) - 1.0) <= tolerance
-    assert abs(float(first["loss/kl"])) <= tolerance
+    assert abs(float(first["loss/mean_ratio"]) - 1.0) <= 2e-3
+    assert abs(float(first["loss/kl"])) <= 2e-3

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
 from torchrl_mcp.objectives import MirroredSamples
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 
 MIRRORED = {
     "scratch": ["method=scratch", "task=heading"],
@@ -21,8 +21,7 @@ MIRRORED = {
 
 def trainer_of(folder, *overrides):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "autocast=false", "width=0.05", f"run_dir={folder}"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [*settings, *overrides])
+    cfg = compose_run(*settings, *overrides)
     torch.manual_seed(0)
     source = build.make_source(cfg)
     agent = build.make_agent(cfg, source.env)

@@ -1,12 +1,12 @@
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.runs import build, builtin, experiment, policies, publish, records
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
@@ -19,8 +19,7 @@ def _log_elsewhere(tmp_path, monkeypatch):
 
 
 def configure(folder, *overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", [*SMOKE, f"run_dir={folder}", *overrides])
+    return compose_run(*SMOKE, f"run_dir={folder}", *overrides)
 
 
 @pytest.fixture(scope="module")

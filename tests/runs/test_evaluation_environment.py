@@ -4,11 +4,11 @@ from functools import cache
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp.evaluation.rollout import evaluate
 from torchrl_mcp.runs import build, requirements
+from torchrl_mcp.runs.configuration import compose_run
 
 STAGES = {
     "holdout": "pretrain",
@@ -90,8 +90,7 @@ def _log_elsewhere(tmp_path, monkeypatch):
 
 
 def configure(task, *overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", [f"task={task}", f"stage={STAGES[task]}", "num_threads=1", *overrides])
+    return compose_run(f"task={task}", f"stage={STAGES[task]}", "num_threads=1", *overrides)
 
 
 @cache

@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from hydra.errors import MissingConfigException
 
 from torchrl_mcp.envs import Heading
@@ -13,6 +12,7 @@ from torchrl_mcp.envs.physics import engines
 from torchrl_mcp.evaluation.rollout import evaluate
 from torchrl_mcp.runs import configuration, experiment, policies, requirements
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 
 EPISODES = 64
@@ -27,8 +27,7 @@ APART = 0.15
 
 
 def composed(*overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", ["method=scratch", "task=heading", "stage=transfer", "run_dir=never", *overrides])
+    return compose_run("method=scratch", "task=heading", "stage=transfer", "run_dir=never", *overrides)
 
 
 def rows(folder):

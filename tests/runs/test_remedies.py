@@ -4,16 +4,15 @@ from importlib.util import find_spec
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
 from torchrl_mcp.runs import experiment, requirements
+from torchrl_mcp.runs.configuration import compose_run
 
 HEADING = ["task=heading", "character=humanoid"]
 
 
 def configure(folder, *overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", ["preset=smoke", "logger=none", f"run_dir={folder / 'run'}", *overrides])
+    return compose_run("preset=smoke", "logger=none", f"run_dir={folder / 'run'}", *overrides)
 
 
 @pytest.mark.parametrize("kind", ["wandb", "mlflow"])

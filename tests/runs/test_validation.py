@@ -4,11 +4,11 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from torchrl_mcp import conf
 from torchrl_mcp.runs import configuration, experiment
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.validation import RULES
 
 METHODS = sorted(path.stem for path in (Path(conf.__file__).parent / "method").glob("*.yaml"))
@@ -19,8 +19,7 @@ PLACES = [(method, "heading") for method in METHODS] + [
 
 @cache
 def composed(*overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", ["run_dir=never", *overrides])
+    return compose_run("run_dir=never", *overrides)
 
 
 def place(method, task):

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from torchrl_mcp.envs import Holdout
 from torchrl_mcp.runs import build, experiment, records
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint, collectors
 from torchrl_mcp.training.collectors import Batches, LocalSource, RemoteSource
 from torchrl_mcp.training.progress import Stopwatch
@@ -39,8 +39,7 @@ def private_ray(monkeypatch):
 
 
 def configure(folder, *overrides):
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", overrides=[*SMOKE, f"run_dir={folder}", *overrides])
+    return compose_run(*SMOKE, f"run_dir={folder}", *overrides)
 
 
 def rows(folder):

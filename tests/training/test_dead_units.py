@@ -4,10 +4,10 @@ import csv
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from torch import nn
 
 from torchrl_mcp.runs import build, experiment
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.dead_units import DeadUnits
 
 METHODS = ("mcp", "moe", "latent_space", "finetune", "hierarchical", "option_critic", "scratch")
@@ -15,8 +15,7 @@ METHODS = ("mcp", "moe", "latent_space", "finetune", "hierarchical", "option_cri
 
 def configure(*overrides):
     settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", *overrides]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return compose("train", settings)
+    return compose_run(*settings)
 
 
 @pytest.fixture

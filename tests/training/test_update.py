@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torch import nn
 
 from torchrl_mcp.runs import build
+from torchrl_mcp.runs.configuration import compose_run
 
 
 class Pull(nn.Module):
@@ -30,8 +30,7 @@ def updated(folder, max_grad_norm):
     """A trainer and both losses after an update by plain gradient descent with step size 0.1, and its metrics."""
     settings = ["preset=smoke", "method=scratch", "task=holdout", "logger=none", "num_threads=1", f"run_dir={folder}"]
     settings += ["training.frames_per_batch=32", "training.minibatch_size=8", "training.num_epochs=3"]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        cfg = compose("train", [*settings, f"objective.max_grad_norm={max_grad_norm}"])
+    cfg = compose_run(*settings, f"objective.max_grad_norm={max_grad_norm}")
     torch.manual_seed(0)
     source = build.make_source(cfg)
     agent = build.make_agent(cfg, source.env)

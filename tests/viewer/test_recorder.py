@@ -6,12 +6,12 @@ import os
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_mcp.envs.rendering import opengl
 from torchrl_mcp.runs import experiment
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.viewer.recorder import draw_weights
 
 RECORDED = ["record_interval=2", "+recorder.seconds=0.3", "+recorder.width=96", "+recorder.height=64"]
@@ -20,8 +20,7 @@ RECORDED = ["record_interval=2", "+recorder.seconds=0.3", "+recorder.width=96", 
 def train(folder, *overrides):
     settings = ["preset=smoke", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
     settings += ["task.pretrain.max_episode_steps=20", *overrides]
-    with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
-        return experiment.train(compose("train", settings))
+    return experiment.train(compose_run(*settings))
 
 
 def learnt(folder):

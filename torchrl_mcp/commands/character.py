@@ -1,7 +1,7 @@
 """Checking files of characters, and converting other bodies into characters."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -48,7 +48,7 @@ GRAVITY = 9.81
 
 def check(arguments: argparse.Namespace) -> int:
     """Print each violation of the contract; return the exit status."""
-    spec = _read(arguments.file)
+    spec = _spec(mujoco.MjSpec.from_file, str(arguments.file), arguments.file)
     model = spec.compile()
     feet, sides = _feet(model, arguments.feet), _sides(model, arguments.sides)
     found = violations(spec, feet=feet, sides=sides)
@@ -64,7 +64,11 @@ def adapt(arguments: argparse.Namespace) -> int:
         ValueError: If MuJoCo cannot read the file or what was made of it, a file to write is there already, or the name
             is of another character or module.
     """
-    name, folder, source = arguments.name, arguments.output, _read(arguments.file).compile()
+    name, folder, source = (
+        arguments.name,
+        arguments.output,
+        _spec(mujoco.MjSpec.from_file, str(arguments.file), arguments.file).compile(),
+    )
     body = adapted(
         source,
         root=arguments.root,
@@ -77,7 +81,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     body.spec.modelname = name
     body.spec.compile()
     text = body.spec.to_xml()
-    written = _parsed(text, f"what was made of {arguments.file}")
+    written = _spec(mujoco.MjSpec.from_string, text, f"what was made of {arguments.file}")
     model = written.compile()
     ends = tuple(key_bodies(model))
     _require_unused(name, folder)
@@ -142,24 +146,14 @@ def _row(name: str, drive: Drive, limits: tuple[float, float]) -> dict[str, str]
     }
 
 
-def _read(path: Path) -> mujoco.MjSpec:
-    """Read and compile an MJCF file.
+def _spec(read: Callable[[str], mujoco.MjSpec], source: str, what: object) -> mujoco.MjSpec:
+    """Read MJCF from a file or a text, and compile it.
 
     Raises:
         ValueError: If MuJoCo cannot.
     """
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {path}: {error}") from error
-    return spec
-
-
-def _parsed(text: str, what: str) -> mujoco.MjSpec:
-    """Read and compile MJCF."""
-    try:
-        spec = mujoco.MjSpec.from_string(text)
+        spec = read(source)
         spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {what}: {error}") from error

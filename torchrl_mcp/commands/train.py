@@ -122,13 +122,8 @@ def run_benchmark(arguments: list[str]) -> None:
     announce(PROGRAM)
     from torchrl_mcp.runs import benchmark
 
-    try:
-        with _interruptible():
-            benchmark.main(settings)
-    except HydraException:  # some are OSErrors
-        raise
-    except (OSError, ValueError) as error:
-        sys.exit(f"{PROGRAM}: {error}")
+    with _interruptible():
+        benchmark.main(settings)
 
 
 def _resume(cfg: DictConfig) -> Path:

@@ -35,7 +35,7 @@ def mean(values: Sequence[float]) -> Estimate:
     Raises:
         ValueError: If there is no value.
     """
-    return _estimate([values], _pooled(np.mean))
+    return _estimate([values], np.mean)
 
 
 def deviation(values: Sequence[float]) -> float:
@@ -97,11 +97,6 @@ def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[s
     shared = [name for name in (numbers[0] if numbers else {}) if all(name in other for other in numbers)]
     kept = [name for name in shared if not name.startswith(left_out)]
     return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
-
-
-def _pooled(statistic: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
-    """Return the statistic of all samples together."""
-    return lambda *samples, axis: statistic(np.concatenate(samples, axis=axis), axis=axis)
 
 
 def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray]) -> Estimate:

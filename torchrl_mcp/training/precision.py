@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 import torch
 
+from torchrl_mcp.training.threads import threads
+
 ADVANTAGE = 0.8
 """Largest time of a product in bfloat16, relative to float32, at which bfloat16 is chosen."""
 SHAPE = (256, 1024, 1024)
@@ -100,12 +102,8 @@ def relative_time(device: torch.device | str) -> float:
     rows, inputs, outputs = SHAPE
     operands = torch.ones(rows, inputs, device=device), torch.ones(outputs, inputs, device=device)
     products = [[x.to(dtype) for x in operands] for dtype in (torch.bfloat16, torch.float32)]
-    num_threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # another run may use the other cores
-    try:
+    with threads(1):  # another run may use the other cores
         times = [[_seconds(*product) for product in products] for _ in range(1 + REPEATS)]  # the first prepares kernels
-    finally:
-        torch.set_num_threads(num_threads)
     low, full = (min(of_product) for of_product in zip(*times[1:], strict=True))
     return low / full
 

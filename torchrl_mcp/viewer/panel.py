@@ -1,6 +1,7 @@
 """The panel of the web viewer: a slider for the target direction, and the gates as bars that can be dragged."""
 
 from collections.abc import Callable
+from functools import partial
 
 from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from PIL import ImageColor
@@ -66,23 +67,11 @@ def _draw_weights(steering: Steering, weights: Weights, send: Callable[[Command]
         imgui.SetCursorPos(corner)
         imgui.InvisibleButton(f"bar{number}", imgui.Vec2(WIDTH, HEIGHT))
         if imgui.IsItemActive():
-            send(_pin(number, (imgui.GetMousePos().x - left) / WIDTH))
+            send(partial(Steering.pin, primitive=number, weight=(imgui.GetMousePos().x - left) / WIDTH))
         imgui.SameLine()
         if imgui.SmallButton(f"{number + 1}"):
-            send(_play_alone(number))
+            send(partial(Steering.play_alone, primitive=number))
         if number in steering.player.pinned:
             imgui.SameLine()
             if imgui.SmallButton(f"release##{number}"):
-                send(_release(number))
-
-
-def _pin(primitive: int, weight: float) -> Command:
-    return lambda steering: steering.pin(primitive, weight)
-
-
-def _release(primitive: int) -> Command:
-    return lambda steering: steering.release(primitive)
-
-
-def _play_alone(primitive: int) -> Command:
-    return lambda steering: steering.play_alone(primitive)
+                send(partial(Steering.release, primitive=number))

@@ -4,7 +4,6 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -74,7 +73,7 @@ class Recorder:
         """
         if metrics["iteration"] % self._interval:
             return
-        with _own_random_numbers():
+        with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             for name, path in self._record(step):
                 for logger in self._loggers:
                     show(logger, name, path, step)
@@ -159,10 +158,3 @@ def show(logger: Logger, name: str, path: Path, step: int) -> None:
         import mlflow
 
         mlflow.log_artifact(str(path), FOLDER)
-
-
-@contextmanager
-def _own_random_numbers() -> Iterator[None]:
-    """Restore torch's random state after the block."""
-    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        yield
