@@ -187,7 +187,7 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
 
 
 def _about_axes(axes: np.ndarray, torques: Sequence[float]) -> list[float]:
-    """Return the torques of hinges with axes ``(N, 3)`` about x, y and z: the smallest where there is no hinge."""
+    """Return torques in N m about x, y and z, of hinges with axes ``(N, 3)``: the smallest where there is none."""
     parts = (abs(axes) * np.asarray(torques)[:, None]).max(0)
     return np.maximum(parts, min(torques)).tolist()
 

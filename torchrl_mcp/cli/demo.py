@@ -25,7 +25,7 @@ def main() -> None:
     try:
         run(output, arguments.overrides, preset=preset, pretrain=arguments.pretrain)
     except HydraException as error:
-        sys.exit(f"{PROGRAM}: {answer(error, arguments.overrides, multirun=None)}")
+        sys.exit(f"{PROGRAM}: {answer(error, arguments.overrides)}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
 

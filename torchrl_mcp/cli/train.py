@@ -76,7 +76,8 @@ def main() -> None:
         with trusting(trusted), termination_as_interrupt():
             run_benchmark(arguments) if is_benchmark else run()
     except HydraException as error:
-        sys.exit(f"{PROGRAM}: {answer(error, words, multirun=is_benchmark or arguments != words)}")
+        several = None if is_benchmark or arguments != words else "add --multirun to train with each"
+        sys.exit(f"{PROGRAM}: {answer(error, words, several=several)}")
     except AttributeError:
         if __debug__:
             raise

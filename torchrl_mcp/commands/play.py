@@ -91,7 +91,7 @@ def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Charact
         if cfg.stage.name not in cfg.task:
             cfg = configuration.compose_run(*own, *arguments.settings, "stage=transfer")
     except HydraException as error:
-        raise ValueError(answer(error, arguments.settings, multirun=None)) from error
+        raise ValueError(answer(error, arguments.settings)) from error
     env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **task_settings(arguments.task))
     act = {"zero": env.action_spec.zero, "random": env.action_spec.rand}[arguments.agent]
     policy = TensorDictModule(lambda observation: act(), in_keys=["observation"], out_keys=["action"])

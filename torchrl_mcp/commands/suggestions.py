@@ -16,18 +16,17 @@ EXTRAS = {"joblib": "launchers", "submitit": "launchers", "ray": "ray-launcher",
 """Extras of the library with a plugin of Hydra, by the beginning of the plugin's name."""
 
 
-def answer(error: HydraException, words: Sequence[str], *, multirun: bool | None) -> str:
+def answer(error: HydraException, words: Sequence[str], *, several: str | None = "give one") -> str:
     """Return what is wrong with a command line and how to write it, a line for each mistake.
 
     Args:
         error: The exception of Hydra.
         words: The command line.
-        multirun: Whether settings may have several values, or None if they never can.
+        several: What to do about a setting with several values, or None if it may have them.
     """
     settings = [word for word in words if ("=" in word or word.startswith("~")) and not word.startswith("-")]
-    lines = (
-        stray(words) or unreadable(settings) or ([] if multirun else swept(settings, multirun)) or suggestions(settings)
-    )
+    lines = stray(words) or unreadable(settings)
+    lines = lines or (swept(settings, several) if several else []) or suggestions(settings)
     if not lines and isinstance(error, MissingConfigException):
         lines = [_missing(error)]
     return "\n".join(lines) or "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
@@ -46,10 +45,9 @@ def unreadable(settings: Sequence[str]) -> list[str]:
     return [_quote(word) for word in settings if "=" in word and not _is_readable(word)]
 
 
-def swept(settings: Sequence[str], multirun: bool | None = False) -> list[str]:
-    """Return a line for each setting with several values, with ``--multirun`` if the command has it."""
+def swept(settings: Sequence[str], remedy: str) -> list[str]:
+    """Return a line with a remedy for each setting with several values."""
     overrides = OverridesParser.create().parse_overrides(list(settings))
-    remedy = "give one" if multirun is None else "add --multirun to train with each"
     return [
         f"{override.input_line} has several values: {remedy}" for override in overrides if override.is_sweep_override()
     ]
