@@ -1,4 +1,4 @@
-"""Unit quaternions ``(w, x, y, z)`` as functions of tensors, batched over leading dimensions."""
+"""Rotations as functions of tensors, batched over leading dimensions: unit quaternions ``(w, x, y, z)``, and angles."""
 
 import torch
 from torch import Tensor
@@ -126,3 +126,8 @@ def continuous(q: Tensor) -> Tensor:
     first = torch.where(q[..., :1, 0] < 0, -1.0, 1.0).to(q.dtype)
     turns = torch.where((q[..., 1:, :] * q[..., :-1, :]).sum(-1) < 0, -1.0, 1.0).to(q.dtype)
     return q * torch.cat([first, turns], dim=-1).cumprod(-1).unsqueeze(-1)
+
+
+def unit_vector(angle: Tensor) -> Tensor:
+    """Return (cos, sin) of angles in radians, ``(*B, 2)``."""
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)

@@ -1,6 +1,5 @@
 """What CONTRIBUTING says about additions is enough: files of one's own, outside the library, and no other."""
 
-import csv
 import json
 import re
 import sys
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import pytest
 import torch
 from omegaconf import OmegaConf
+from smoke import rows
 
 from torchrl_mcp.runs import build, policies, records
 from torchrl_mcp.runs.trust import trusting
@@ -180,12 +180,6 @@ def again(kind, command, run):
         return outcome.stdout
 
     return call
-
-
-def rows(run):
-    with (run / "metrics.csv").open(newline="") as file:
-        lines = csv.DictReader(file)
-        return [{k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in lines]
 
 
 def restored(kind, run):

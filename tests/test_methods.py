@@ -1,19 +1,19 @@
 """Every method from pre-training to transfer, evaluation and a resumed run, in one iteration or two each."""
 
 import ast
-import csv
 import shutil
 from pathlib import Path
 
 import pytest
+import smoke
 from omegaconf import OmegaConf
+from smoke import rows
 
 import torchrl_mcp
 from torchrl_mcp import conf
 from torchrl_mcp.report.comparison import choices
 from torchrl_mcp.report.results import read_run
 from torchrl_mcp.runs import build, experiment, policies
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.transfer import fingerprint
 
@@ -42,14 +42,7 @@ SMALL = [
 
 
 def configure(folder, *overrides):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
-    return compose_run(*settings, *SMALL, *overrides)
-
-
-def rows(folder):
-    times = ("seconds", "time/")
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [{k: v for k, v in row.items() if not k.startswith(times)} for row in csv.DictReader(file)]
+    return smoke.configure(folder, *SMALL, *overrides)
 
 
 def fingerprints(folder):

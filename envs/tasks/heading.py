@@ -12,6 +12,7 @@ from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_sign
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
@@ -153,11 +154,6 @@ class Heading(PDCharacterEnv):
     def _target_velocity(self) -> Tensor:
         """The target direction times the target speed, ``(N, 2)``, in m/s."""
         return unit_vector(self.episode["direction"]) * self.episode["speed"].unsqueeze(-1)
-
-
-def unit_vector(angle: Tensor) -> Tensor:
-    """(cos, sin) of an angle in radians, shape ``(*B, 2)``."""
-    return torch.stack([angle.cos(), angle.sin()], -1)
 
 
 def _speeds(speed: float | Sequence[float]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import SIZES
 from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.tasks.ranges import Ranges
 
 SUCCESS_DISTANCE = 0.5
@@ -73,7 +74,7 @@ def places(root: Tensor, drawn: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
 
 def steps(distances: Tensor, directions: Tensor) -> Tensor:
     """Displacements ``(*B, 2)`` from lengths in metres and directions in radians."""
-    return torch.stack([directions.cos(), directions.sin()], -1) * distances.unsqueeze(-1)
+    return unit_vector(directions) * distances.unsqueeze(-1)
 
 
 def mocap_positions(model: mujoco.MjModel) -> Tensor:

@@ -9,6 +9,7 @@ from zipfile import ZipFile
 
 import pytest
 import torch
+from smoke import SMOKE, configure
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.envs.utils import step_mdp
 
@@ -47,10 +48,9 @@ def played(gate, **kwargs):
 def run(tmp_path_factory):
     """The first steps of a gate for heading over the library's primitives."""
     folder = tmp_path_factory.mktemp("secret") / "run"
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
-    settings += ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
+    settings = ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
     settings += ["width=1", "gating.network.width=0.1", "critic.width=0.1"]
-    return experiment.train(compose_run(*settings, "task.evaluation.max_episode_steps=30"))
+    return experiment.train(configure(folder, *settings, "task.evaluation.max_episode_steps=30"))
 
 
 @pytest.fixture(scope="module")
@@ -92,11 +92,10 @@ def test_a_gate_acts_as_its_run_does_without_holding_the_primitives(run, library
 
 
 def test_a_gate_that_began_as_another_gate_leaves_out_the_same_parts(run, tmp_path):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={tmp_path / 'next'}"]
-    settings += ["method=mcp", "task=location", "stage=transfer", f"pretrained={run}", "width=1"]
+    settings = ["method=mcp", "task=location", "stage=transfer", f"pretrained={run}", "width=1"]
     settings += ["gating.network.width=0.1", "critic.width=0.1"]
     settings += ["transfer.keep=[primitives,observation_normaliser,gating]"]
-    experiment.train(compose_run(*settings))
+    experiment.train(configure(tmp_path / "next", *settings))
     gate = tmp_path / "gate.torchrl"
     policies.publish_run(tmp_path / "next", gate)
     assert set(checkpoint.shared(gate)) == {"primitives", "observation_normaliser"}
@@ -104,11 +103,10 @@ def test_a_gate_that_began_as_another_gate_leaves_out_the_same_parts(run, tmp_pa
 
 
 def test_training_begins_with_a_built_in_gate_and_the_primitives_under_it(tmp_path):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={tmp_path}"]
-    settings += ["method=mcp", "task=location", "character=biped", "stage=transfer", "pretrained=builtin:biped-heading"]
+    settings = ["method=mcp", "task=location", "character=biped", "stage=transfer", "pretrained=builtin:biped-heading"]
     settings += ["transfer.keep=[primitives,observation_normaliser,gating]", "width=0.5"]
     settings += ["transfer.freeze=[primitives,observation_normaliser,gating]", "training.total_frames=128"]
-    experiment.train(compose_run(*settings))
+    experiment.train(configure(tmp_path, *settings))
     _, trained, _ = policies.restore(tmp_path, num_envs=1, seed=0)
     _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "heading"), num_envs=1, seed=0)
     for part in ("primitives", "observation_normaliser", "gating"):
@@ -122,17 +120,9 @@ def gate_logits(parts, state, goal):
 
 def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     known = "primitives,observation_normaliser,gating,goal_normaliser"
-    settings = [
-        "preset=smoke",
-        "logger=none",
-        "num_threads=1",
-        "progress_bar=false",
-        f"run_dir={tmp_path}",
-        "width=0.5",
-    ]
-    settings += ["method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
+    settings = ["width=0.5", "method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
     settings += [f"transfer.keep=[{known}]", f"transfer.freeze=[{known}]", "training.total_frames=128"]
-    experiment.train(compose_run(*settings, "waypoint=true", "transfer.goal_entry=waypoint"))
+    experiment.train(configure(tmp_path, *settings, "waypoint=true", "transfer.goal_entry=waypoint"))
     _, carry, env = policies.restore(tmp_path, num_envs=20, seed=0)
     _, gate, _ = policies.restore(builtin.builtin("mcp", "biped", "location"), num_envs=1, seed=0)
     scene = env.reset()
@@ -143,9 +133,8 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
 
 @pytest.mark.parametrize(("task", "known"), [("carry", "has target.position, "), ("heading", "is one entry")])
 def test_an_entry_that_the_goal_lacks_is_refused(task, known, tmp_path):
-    settings = ["preset=smoke", "logger=none", f"run_dir={tmp_path}", "method=mcp", f"task={task}", "character=biped"]
-    settings += ["stage=transfer", "pretrained=builtin", "transfer.goal_entry=place"]
-    cfg = compose_run(*settings)
+    settings = ["method=mcp", f"task={task}", "character=biped", "stage=transfer", "pretrained=builtin"]
+    cfg = configure(tmp_path, *settings, "transfer.goal_entry=place")
     with pytest.raises(ValueError, match=f"transfer.goal_entry=place is no entry of the task's goal, which {known}"):
         experiment.train(cfg)
 
@@ -189,7 +178,7 @@ def test_the_card_compares_no_range_of_speeds_with_the_paper(tmp_path):
 
 
 def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "method=mcp", "character=biped"]
+    settings = [*SMOKE, "method=mcp", "character=biped"]
     pretraining = ["task=imitation", "stage=pretrain", "motions=single", f"run_dir={tmp_path / 'pretraining'}"]
     transfer = [
         "task=heading",

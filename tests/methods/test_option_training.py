@@ -1,15 +1,13 @@
 """Methods that hold on to an option, in the training loop: interrupted runs, frozen options, many options at once."""
 
-import csv
-
 import pytest
+import smoke
 import torch
+from smoke import final_parts, rows
 
 from torchrl_mcp.runs import build, experiment, policies
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.trainer import Trainer
 
-TIMES = ("seconds", "time/")
 BIPED = ["character=biped", "task=imitation"]
 SMALL = {
     "option_critic": ["parts.options.trunk_cells=[16]", "parts.terminations.num_cells=[16]", "parts.values_cells=[16]"],
@@ -22,19 +20,7 @@ SMALL = {
 
 
 def configure(folder, method, *overrides):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "checkpoint_interval=1"]
-    settings += [f"run_dir={folder}", f"method={method}", *SMALL[method]]
-    return compose_run(*settings, *overrides)
-
-
-def rows(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [{k: v for k, v in row.items() if not k.startswith(TIMES)} for row in csv.DictReader(file)]
-
-
-def final_parts(folder):
-    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
-    return agent.parts.state_dict()
+    return smoke.configure(folder, "checkpoint_interval=1", f"method={method}", *SMALL[method], *overrides)
 
 
 @pytest.fixture(scope="module")

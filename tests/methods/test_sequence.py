@@ -8,7 +8,7 @@ from torch import nn
 
 from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Dribble, Heading
-from torchrl_mcp.envs.tasks.heading import unit_vector
+from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.tasks.waypoints import place_seen
 from torchrl_mcp.methods.sequence import Act, GatesInARow
 from torchrl_mcp.runs.builtin import builtin

@@ -1,25 +1,20 @@
 import pytest
 import torch
 from omegaconf import OmegaConf
+from smoke import configure
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.runs import build, builtin, experiment, policies, publish, records
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 
-SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]
 
 
 @pytest.fixture(autouse=True)
 def _log_elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo logs divergence in the working directory
-
-
-def configure(folder, *overrides):
-    return compose_run(*SMOKE, f"run_dir={folder}", *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The command line: what it runs, what it refuses and what it says instead."""
 
-import hashlib
 import json
 import re
 import shutil
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
+from smoke import SMOKE, contents
 from torch import nn
 
 from torchrl_mcp import conf
@@ -18,19 +18,14 @@ from torchrl_mcp.runs import benchmark, build, experiment, policies, records
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.checkpoint import run_checkpoint
 
-FAST = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false"]
 LENGTHS = ["task.evaluation.max_episode_steps=40", "task.pretrain.max_episode_steps=30"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
-
-
-def contents(folder):
-    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")
 def run(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    assert command("train", *FAST, *LENGTHS, cwd=folder).returncode == 0
+    assert command("train", *SMOKE, *LENGTHS, cwd=folder).returncode == 0
     name = "_".join(["preset-smoke", *LENGTHS]).replace("=", "-")
     return folder / f"runs/holdout-ant/pretrain/mcp/{name}/seed0"
 
@@ -41,13 +36,13 @@ def test_a_run_leaves_one_folder_with_configuration_metrics_and_checkpoints(run)
     assert {path.name for path in run.iterdir()} == {"config.yaml", "origin.json", "metrics.csv", "checkpoints"}
     assert OmegaConf.load(run / "config.yaml").method.name == "mcp"
     origin = json.loads((run / "origin.json").read_text())
-    assert origin["command"] == ["torchrl-mcp-train", *FAST, *LENGTHS]
+    assert origin["command"] == ["torchrl-mcp-train", *SMOKE, *LENGTHS]
     assert origin["choices"]["preset"] == "smoke"
     assert "hydra/launcher" not in origin["choices"]
 
 
 def test_a_multirun_makes_a_folder_per_job(command, tmp_path):
-    outcome = command("train", "-m", *FAST, "mixer=multiplicative,additive", "training.total_frames=128", cwd=tmp_path)
+    outcome = command("train", "-m", *SMOKE, "mixer=multiplicative,additive", "training.total_frames=128", cwd=tmp_path)
     assert outcome.returncode == 0, outcome.stderr
     assert len(list(tmp_path.rglob("metrics.csv"))) == 2
 
@@ -79,7 +74,7 @@ def test_evaluation_reports_as_many_episodes_as_asked_and_writes_them_down(comma
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arguments, remedy):
-    outcome = command("train", *FAST, *arguments, cwd=tmp_path)
+    outcome = command("train", *SMOKE, *arguments, cwd=tmp_path)
     assert outcome.returncode != 0
     assert remedy in outcome.stderr
     assert "Traceback" not in outcome.stderr
@@ -88,8 +83,8 @@ def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arg
 
 def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(command, run):
     before = contents(run)
-    same = command("train", *FAST, *LENGTHS, f"run_dir={run}", cwd=run.parents[5])
-    other = command("train", *FAST, LENGTHS[0], f"run_dir={run}", cwd=run.parents[5])
+    same = command("train", *SMOKE, *LENGTHS, f"run_dir={run}", cwd=run.parents[5])
+    other = command("train", *SMOKE, LENGTHS[0], f"run_dir={run}", cwd=run.parents[5])
     assert same.returncode != 0 != other.returncode
     assert f"continue it with torchrl-mcp-train resume={run}" in same.stderr
     assert "holds a run that differs in task: give another run_dir" in other.stderr
@@ -102,7 +97,7 @@ def test_a_folder_with_checkpoints_of_a_run_without_its_configuration_is_refused
     (copy / "config.yaml").unlink()
     before = contents(copy)
     with pytest.raises(ValueError, match=r"config\.yaml is missing: put that back to continue the run"):
-        experiment.train(compose_run(*FAST, f"run_dir={copy}"))
+        experiment.train(compose_run(*SMOKE, f"run_dir={copy}"))
     assert contents(copy) == before
 
 
@@ -122,7 +117,7 @@ def test_a_run_of_a_gpu_goes_on_without_one_if_told_to(run, tmp_path):
 
 
 def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
-    outcome = command("train", *FAST, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
+    outcome = command("train", *SMOKE, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
     assert outcome.returncode != 0
     assert "has networks of num_primitives=8, which do not fit num_primitives=4: change either" in outcome.stderr
     assert list(tmp_path.iterdir()) == []
@@ -130,7 +125,7 @@ def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
 
 def test_transfer_from_another_character_and_method_names_both(command, tmp_path):
     arguments = ["task=heading", "character=humanoid", "method=moe", "stage=transfer", "pretrained=builtin:biped"]
-    outcome = command("train", *FAST, *arguments, cwd=tmp_path)
+    outcome = command("train", *SMOKE, *arguments, cwd=tmp_path)
     assert outcome.returncode != 0
     difference = "networks of method=mcp character=biped, which do not fit method=moe character=humanoid: change either"
     assert difference in outcome.stderr

@@ -1,41 +1,28 @@
 """What happens to a run when something goes wrong: another process, a full disk, a damaged file."""
 
-import csv
-import hashlib
 import json
 import os
 import shutil
 import zipfile
 
 import pytest
+import smoke
 import torch
 from omegaconf import OmegaConf
+from smoke import contents, rows
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_mcp.runs import build, experiment, lock, policies
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.status import status
 from torchrl_mcp.training import checkpoint, run_folder
 
-SETTINGS = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "training.total_frames=640"]
-EVERY = ["checkpoint_interval=1", "keep_checkpoints=9"]
+EVERY = ["training.total_frames=640", "checkpoint_interval=1", "keep_checkpoints=9"]
 SHORT = "training.total_frames=128"
 """A single iteration."""
 
 
 def configure(folder, *overrides):
-    return compose_run(*SETTINGS, *EVERY, f"run_dir={folder}", *overrides)
-
-
-def contents(folder):
-    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
-
-
-def rows(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [
-            {k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in csv.DictReader(file)
-        ]
+    return smoke.configure(folder, *EVERY, *overrides)
 
 
 @pytest.fixture(scope="module")

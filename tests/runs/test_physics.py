@@ -1,11 +1,11 @@
 """Training on MuJoCo Warp, by one word."""
 
-import csv
 import math
 
 import pytest
 import torch
 from hydra.errors import MissingConfigException
+from smoke import rows
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.physics import engines
@@ -28,12 +28,6 @@ APART = 0.15
 
 def composed(*overrides):
     return compose_run("method=scratch", "task=heading", "stage=transfer", "run_dir=never", *overrides)
-
-
-def rows(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        lines = csv.DictReader(file)
-        return [{k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in lines]
 
 
 def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import csv
 
 import pytest
 import torch
+from smoke import SMOKE
 from torch import nn
 
 from torchrl_mcp.runs import build, experiment
@@ -14,8 +15,7 @@ METHODS = ("mcp", "moe", "latent_space", "finetune", "hierarchical", "option_cri
 
 
 def configure(*overrides):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", *overrides]
-    return compose_run(*settings)
+    return compose_run(*SMOKE, *overrides)
 
 
 @pytest.fixture

@@ -9,17 +9,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 from omegaconf import OmegaConf
+from smoke import configure
 
 from torchrl_mcp.runs import experiment, records
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint, precision
 
 X86 = {"architecture": "x86_64", "avx512_bf16": False, "amx_bf16": False}
-
-
-def configure(folder, *overrides):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
-    return compose_run(*settings, *overrides)
 
 
 @pytest.fixture

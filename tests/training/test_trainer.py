@@ -11,32 +11,16 @@ import time
 
 import pytest
 import torch
+from smoke import SMOKE, configure, final_parts, rows
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import build, experiment, policies
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint, run_folder, trainer
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.threads import threads
 from torchrl_mcp.training.trainer import Trainer
 
-TIMES = ("seconds", "time/")
 ONE_BATCH = "training.total_frames=128"
-
-
-def configure(folder, *overrides):
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
-    return compose_run(*settings, *overrides)
-
-
-def rows(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [{k: v for k, v in row.items() if not k.startswith(TIMES)} for row in csv.DictReader(file)]
-
-
-def final_parts(folder):
-    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
-    return agent.parts.state_dict()
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +34,7 @@ def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp
     settings = ["autocast=true", "checkpoint_interval=1", "training.total_frames=768"]
     experiment.train(configure(whole, *settings))
 
-    arguments = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={killed}", *settings]
+    arguments = [*SMOKE, f"run_dir={killed}", *settings]
     run = subprocess.Popen(
         [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
     )

@@ -1,12 +1,12 @@
 """Recordings of a run in training: what they show, where they land, and that the run is the same without them."""
 
-import csv
 import importlib.util
 import os
 
 import pytest
 import torch
 from PIL import Image
+from smoke import rows
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_mcp.envs.rendering import opengl
@@ -21,13 +21,6 @@ def train(folder, *overrides):
     settings = ["preset=smoke", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
     settings += ["task.pretrain.max_episode_steps=20", *overrides]
     return experiment.train(compose_run(*settings))
-
-
-def learnt(folder):
-    with (folder / "metrics.csv").open(newline="") as file:
-        return [
-            {k: v for k, v in row.items() if not k.startswith(("seconds", "time/"))} for row in csv.DictReader(file)
-        ]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +50,7 @@ def test_tensorboard_shows_them_at_their_step(recorded):
 
 
 def test_a_run_is_the_same_with_recordings_and_without(recorded, tmp_path):
-    assert learnt(recorded) == learnt(train(tmp_path / "plain", "logger=none"))
+    assert rows(recorded) == rows(train(tmp_path / "plain", "logger=none"))
 
 
 def test_weights_are_drawn_a_line_for_each_primitive():

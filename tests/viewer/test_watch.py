@@ -4,9 +4,9 @@ import copy
 
 import pytest
 import torch
+from smoke import configure
 
 from torchrl_mcp.runs import experiment, policies
-from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.viewer.watch import Watch
 
@@ -15,8 +15,7 @@ from torchrl_mcp.viewer.watch import Watch
 def run(tmp_path):
     """A run folder with the checkpoints of two moments, the later of which the test brings in."""
     folder = tmp_path / "run"
-    settings = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", f"run_dir={folder}"]
-    experiment.train(compose_run(*settings, "method=scratch", "task=heading", "stage=transfer"))
+    experiment.train(configure(folder, "method=scratch", "task=heading", "stage=transfer"))
     later, earlier = run_folder.find_all(folder)
     aside = tmp_path / later.name
     later.rename(aside)

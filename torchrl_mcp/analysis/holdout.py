@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from torchrl_mcp.analysis.figures import DIRECTIONS, FAINT, INK, new_figure
 from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.evaluation.rollout import evaluate
 
 QUARTERS = {"0": 0.0, "π/2": math.pi / 2, "π": math.pi, "3π/2": 1.5 * math.pi}
@@ -51,7 +51,7 @@ def play_directions(
         raise ValueError(f"directions has shape {tuple(directions.shape)}: pass one per environment, {env.batch_size}")
     env.reset()
     start = env.get_state()
-    start["goal"] = torch.stack([directions.cos(), directions.sin()], -1).to(start["goal"].dtype)
+    start["goal"] = unit_vector(directions).to(start["goal"].dtype)
     outcome = evaluate(policy, env, deterministic=deterministic, start=start)
     return Trajectories(directions.numpy().astype(np.float64), outcome.positions.numpy())
 

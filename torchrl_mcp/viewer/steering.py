@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchrl_mcp.envs import Carry, Dribble, Heading, Location
-from torchrl_mcp.envs.tasks.heading import unit_vector
+from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.tasks.waypoints import place_ahead
 from torchrl_mcp.viewer.player import Player
 

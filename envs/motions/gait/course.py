@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.motions.gait.curves import MID_STANCE
+from torchrl_mcp.envs.rotations import unit_vector
 
 GRAVITY = 9.81
 
@@ -40,7 +41,7 @@ class Course:
     @property
     def forward(self) -> Tensor:
         """Unit vectors along the path, shape ``(F, 2)``."""
-        return direction(self.heading)
+        return unit_vector(self.heading)
 
     @property
     def lean(self) -> Tensor:
@@ -87,7 +88,7 @@ def plan(speed: Tensor, turn_rate: Tensor, fps: float, height: float, start: int
         start: Frame at the origin.
     """
     heading = accumulated(turn_rate, fps, start)
-    forward, left = direction(heading), direction(heading + torch.pi / 2)
+    forward, left = unit_vector(heading), unit_vector(heading + torch.pi / 2)
     path = accumulated(speed.unsqueeze(-1) * forward, fps, start)
     along, across = torch.gradient(speed, spacing=1 / fps)[0], speed * turn_rate
     acceleration = along.unsqueeze(-1) * forward + across.unsqueeze(-1) * left
@@ -101,11 +102,6 @@ def stride_rate(speed: Tensor, turn_rate: Tensor) -> Tensor:
     Below that, steps become shorter rather than slower; in sharp turns they become quicker.
     """
     return 0.42 + 0.44 * speed + 0.25 * torch.exp(-((speed / 0.35) ** 2)) + 0.03 * turn_rate**2 + 0.006 * turn_rate**4
-
-
-def direction(angle: Tensor) -> Tensor:
-    """Unit vectors ``(*B, 2)`` at angles of shape ``(*B)``."""
-    return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 
 def accumulated(rate: Tensor, fps: float, start: int) -> Tensor:

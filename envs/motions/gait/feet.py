@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.motions.gait.course import FOOTHOLD, Course, Side, between_frames, direction
+from torchrl_mcp.envs.motions.gait.course import FOOTHOLD, Course, Side, between_frames
 from torchrl_mcp.envs.motions.gait.curves import (
     ADVANCE,
     ASIDE,
@@ -18,7 +18,7 @@ from torchrl_mcp.envs.motions.gait.curves import (
     spline,
 )
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
-from torchrl_mcp.envs.rotations import about_y, about_z, multiply
+from torchrl_mcp.envs.rotations import about_y, about_z, multiply, unit_vector
 
 STEP_WIDTH, CURVE_WIDTH, SPOT_WIDTH = 0.12, 0.10, 0.20
 """Distance between the ankles in metres: straight ahead, in a curve, and on the spot, where the legs could cross."""
@@ -100,14 +100,14 @@ def step(course: Course, side: Side, sole: Sole) -> Foot:
     pitch = _rolling(course, side, phase) * torch.deg2rad(spline(FOOT_PITCH, phase))
     ahead, height = rolled(pitch, sole, vigour * spline(ROUNDING, phase))
     height = height + spline(CLEARANCE, phase) * (0.4 * stepping + 0.6 * vigour)
-    outward = side.sign * direction(heading + torch.pi / 2)
+    outward = side.sign * unit_vector(heading + torch.pi / 2)
     aside = spline(ASIDE, phase) * stepping * settled(course.turn_rate, CURVED)
-    ground = position + ahead.unsqueeze(-1) * direction(heading) + aside.unsqueeze(-1) * outward
+    ground = position + ahead.unsqueeze(-1) * unit_vector(heading) + aside.unsqueeze(-1) * outward
     return Foot(
         heading=heading,
         ankle=torch.cat([ground, height.unsqueeze(-1)], dim=-1),
         orientation=multiply(about_z(heading), about_y(-pitch)),
-        support=position + ARCH * direction(heading) - MEDIAL * outward,
+        support=position + ARCH * unit_vector(heading) - MEDIAL * outward,
         unloaded=stepping * _swinging(phase),
     )
 
@@ -145,7 +145,7 @@ def _foothold(course: Course, side: Side, frames: Tensor) -> tuple[Tensor, Tenso
     turn_rate, speed = between_frames(course.turn_rate, frames), between_frames(course.speed, frames)
     width = STEP_WIDTH + (CURVE_WIDTH - STEP_WIDTH) * settled(turn_rate, CURVED)
     width = width + (SPOT_WIDTH - width) * settled((turn_rate / (speed + CREEPING)) ** 2, TIGHT**2)
-    beside = (side.sign * width / 2).unsqueeze(-1) * direction(heading + torch.pi / 2)
+    beside = (side.sign * width / 2).unsqueeze(-1) * unit_vector(heading + torch.pi / 2)
     return between_frames(course.balance, frames) + beside, heading + side.sign * TOE_OUT
 
 
