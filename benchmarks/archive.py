@@ -95,7 +95,8 @@ def write_tables(found: Sequence[Cell], output: Path) -> None:
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
         twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
         stem = output / "_".join([*place, stage] if twice else place)
-        stem.with_suffix(".md").write_text(text_table([line(cell) for cell in here], markdown=True) + "\n")
+        goal = 0.8 * max(float(learning_curve(cell).mean[-1]) for cell in here)
+        stem.with_suffix(".md").write_text(text_table([line(cell, goal) for cell in here], markdown=True) + "\n")
         drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
         curves = [learning_curve(cell) for cell in drawn]
         figure = draw_curves(curves, ylabel="normalised return in training")
@@ -126,8 +127,8 @@ def label(cell: Cell) -> str:
     return ", ".join([cell.title, *steps, *others])
 
 
-def line(cell: Cell) -> dict[str, Any]:
-    """Return a row of the table of a task."""
+def line(cell: Cell, goal: float) -> dict[str, Any]:
+    """Return a row of the table of a task, with the minutes to a return in training."""
     chosen = [run.evaluation["deterministic"] for run in cell.complete]
     deviation = f" ± {cell.deviation():.3f}" if len(cell.by_seed) > 1 else ""
     facts: dict[str, Any] = {
@@ -147,16 +148,16 @@ def line(cell: Cell) -> dict[str, Any]:
     else:
         facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
         facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
-    times = {"minutes": round(cell.seconds / 60), "to 0.8": f"{minutes_to_most(cell):.1f}"}
+    taken = minutes_to(cell, goal)
+    times = {"minutes": round(cell.seconds / 60), "to 0.8": EMPTY if taken is None else f"{taken:.1f}"}
     return facts | times | {"commit": ", ".join(cell.commits)}
 
 
-def minutes_to_most(cell: Cell) -> float:
-    """Return the minutes of training until the learning curve, a mean over seeds, reaches 0.8 of its last value."""
+def minutes_to(cell: Cell, goal: float) -> float | None:
+    """Return the minutes of training until the learning curve, a mean over seeds, reaches a return; None if never."""
     curve = learning_curve(cell)
-    most = 0.8 * curve.mean[-1]
-    reached = next(frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= most)
-    return float(reached) / cell.complete[0].frames * cell.seconds / 60
+    reached = [frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= goal]
+    return float(reached[0]) / cell.complete[0].frames * cell.seconds / 60 if reached else None
 
 
 def learning_curve(cell: Cell) -> Curve:

@@ -16,10 +16,8 @@ Optuna 4 or newer does not go with Hydra's plugin: install it in an environment 
 import argparse
 import csv
 import json
-import math
 import os
 import signal
-import statistics
 import subprocess
 import time
 from pathlib import Path
@@ -79,10 +77,14 @@ def cpu_seconds(pid: int) -> float:
 
 
 def recent_return(folder: Path, share: float) -> float:
-    """Return the median normalised return of training over the last ``share`` of the seconds."""
-    found = [(row["seconds"], row[NORMALISED_RETURN]) for row in read_metrics(folder)]
-    values = [value for seconds, value in found if seconds >= (1 - share) * found[-1][0] and math.isfinite(value)]
-    return statistics.median(values) if values else 0.0
+    """Return the mean normalised return of the episodes that ended in the last ``share`` of the seconds.
+
+    An iteration weighs as much as the episodes that end in it: else early falls would count most.
+    """
+    rows = read_metrics(folder)
+    late = [row for row in rows if row["seconds"] >= (1 - share) * rows[-1]["seconds"] and row["episode/count"] > 0]
+    count = sum(row["episode/count"] for row in late)
+    return sum(row["episode/count"] * row[NORMALISED_RETURN] for row in late) / count if count else 0.0
 
 
 def train(words: list[str], folder: Path, seconds: float, trial: optuna.Trial | None) -> float:

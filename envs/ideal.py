@@ -1,4 +1,4 @@
-"""Bounds on returns from ideal players without a body, which move at the speed that a task asks for."""
+"""Returns of players without a body: of one that stands still, and of one that does what a task asks for."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,11 +11,14 @@ CLOSE = 0.01
 
 
 class Reach(NamedTuple):
-    """Two returns that enclose the returns of a learner.
+    """Two returns with which those of a learner are compared.
+
+    Neither is a bound: who falls earns less than who stands, and an object that is moved to and fro at its target
+    earns a little more than one that rests there.
 
     Args:
         standing: Return of a player that stands still without falling, ``(N,)``.
-        ideal: Return of a player that is limited only by the task's speed, ``(N,)``.
+        ideal: Return of a player that goes where the task leads at its speed, and rests there, ``(N,)``.
     """
 
     standing: Tensor

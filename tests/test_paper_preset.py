@@ -148,7 +148,8 @@ def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
     lmbda, gamma = decays(trainer)
     assert lmbda == pytest.approx(0.5 if method == "option_critic" else 0.95)  # Table 9 has none
     assert gamma == pytest.approx(DISCOUNT[stage])
-    assert (trainer.frames_per_batch, trainer.minibatch_size) == (table["Batch Size"], 256)
+    steps_per_sample = 30 if (method, stage) == ("hierarchical", "transfer") else 1  # Table 8: a sample is a choice
+    assert (trainer.frames_per_batch / steps_per_sample, trainer.minibatch_size) == (table["Batch Size"], 256)
     assert (trainer.num_epochs, trainer.schedule, trainer.autocast, trainer.warmup_batches) == (1, None, False, 0)
     for optimizer in trainer.optimizers.values():
         (group,) = optimizer.param_groups

@@ -19,14 +19,14 @@ POLICY = partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
 FROZEN = ["primitives", "observation_normaliser"]
 
 
-def hierarchical(steps_per_choice=3):
+def hierarchical(steps_per_choice=3, **settings):
     """Return parts and actor of the hierarchical model at transfer."""
     torch.manual_seed(0)
     gating = partial(JointGating, num_cells=(16, 8))
     parts = gated_parts(
         Sizes(S, G, A), gating=gating, primitives=partial(SeparateOptions, policy=POLICY), num_options=K
     )
-    return parts, gated_actor(parts, num_options=K, steps_per_choice=steps_per_choice, frozen=FROZEN)
+    return parts, gated_actor(parts, num_options=K, steps_per_choice=steps_per_choice, frozen=FROZEN, **settings)
 
 
 def option_critic(initial=0.5, epsilon=0.1, frozen=()):
@@ -149,6 +149,18 @@ def test_terminations_are_judged_where_the_option_led_and_not_where_it_acted():
 def test_frozen_terminations_are_not_evaluated_in_the_update():
     _, actor = option_critic(frozen=["options", "terminations", "observation_normaliser"])
     assert ("next", "observation") not in actor.trained.in_keys
+
+
+@pytest.mark.parametrize("noise", [True, False])
+def test_without_action_noise_the_chosen_primitive_plays_its_mean_and_the_choice_stays_random(noise):
+    parts, actor = hierarchical(action_noise=noise)
+    with torch.no_grad():
+        out = actor.policy(situations().expand(50, N).reshape(-1))
+        states = out["normalised", "observation"]
+        chosen = zip(out["option"].tolist(), states, strict=True)
+        means = torch.stack([parts["primitives"].policies[k](state, state[:0])[0] for k, state in chosen])
+    assert len(out["option"].view(50, N)[:, 0].unique()) > 1
+    assert torch.allclose(out["action"], means, atol=1e-6) != noise
 
 
 def test_the_gate_refuses_to_train_the_primitives():

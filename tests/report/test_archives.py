@@ -53,7 +53,7 @@ def add_tracking_error(run):
     path.write_text(json.dumps(found))
 
 
-def test_the_minutes_to_most_of_a_return_are_those_of_the_learning_curve(write_run, monkeypatch):
+def test_the_minutes_to_a_return_are_those_of_the_learning_curve(write_run, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     archive = importlib.import_module("archive")
     run = write_run("run", score=0.9)
@@ -62,7 +62,8 @@ def test_the_minutes_to_most_of_a_return_are_those_of_the_learning_curve(write_r
     with (run / "metrics.csv").open("w", newline="") as file:
         csv.writer(file).writerows([header, *rows])
     (cell,) = cells(find_runs([run.parent])[0])
-    assert archive.minutes_to_most(cell) == pytest.approx(8.0, abs=0.2)
+    assert archive.minutes_to(cell, 0.8) == pytest.approx(8.0, abs=0.2)
+    assert archive.minutes_to(cell, 1.1) is None
 
 
 @pytest.fixture

@@ -57,7 +57,12 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
 
 
 def gated_actor(
-    parts: nn.ModuleDict, *, num_options: int, steps_per_choice: int, frozen: Collection[str] = ()
+    parts: nn.ModuleDict,
+    *,
+    num_options: int,
+    steps_per_choice: int,
+    action_noise: bool = True,
+    frozen: Collection[str] = (),
 ) -> OptionActor:
     r"""Draw a primitive from the gate :math:`w(s, g)` every ``steps_per_choice`` steps, and let it act in between.
 
@@ -65,6 +70,7 @@ def gated_actor(
         parts: Made by :func:`gated_parts`.
         num_options: Number of options, ``K``, each of which is a primitive.
         steps_per_choice: Control steps for which a primitive acts.
+        action_noise: Whether a primitive samples its actions, from which the gate learns nothing, or plays their mean.
         frozen: Names of the parts that do not change in training.
 
     Raises:
@@ -87,7 +93,7 @@ def gated_actor(
         TensorDictModule(gate, in_keys=[STATE, GOAL, "begins"], out_keys=["gate_logits"]),
         choice,
         TensorDictModule(keep_option, in_keys=["begins", "option", "held_option"], out_keys=["option"]),
-        *_acting(parts),
+        *_acting(parts, noise=action_noise),
     )
     return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
 
@@ -112,7 +118,9 @@ class Clock(nn.Module):
         return held_steps.remainder(self.steps_per_choice) == 0
 
 
-def _acting(parts: nn.ModuleDict) -> tuple[TensorDictModule, TensorDictModule]:
+def _acting(parts: nn.ModuleDict, *, noise: bool = True) -> tuple[TensorDictModule, ...]:
+    if not noise:
+        return (TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["action", "scale"]),)
     return (
         TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["loc", "scale"]),
         sampler("action", IndependentNormal, loc="loc", scale="scale"),

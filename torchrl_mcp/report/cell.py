@@ -80,6 +80,12 @@ class Cell:
         return all(self.choices[name] == value for name, value in standard.items())
 
     @property
+    def is_shared(self) -> bool:
+        """Whether several seeds begin with the networks of the same pre-training."""
+        begun = {run.settings.get("pretrained") for run in self.complete}
+        return len(self.by_seed) > 1 and len(begun) == 1 and begun != {None}
+
+    @property
     def reported(self) -> Reported | None:
         """The paper's figure, if it has one."""
         comparable = self.stage == "transfer" and self.is_standard
@@ -155,6 +161,7 @@ class Cell:
         return [
             *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
             *(["one seed: the interval is over its episodes"] if len(self.by_seed) == 1 else []),
+            *(["seeds share one pre-training: their spread lacks that of pre-trainings"] if self.is_shared else []),
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(
                 f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, which training would not do"
