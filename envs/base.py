@@ -269,7 +269,15 @@ class CharacterEnv(EnvBase):
         shape, one = self.batch_size, (self.num_envs, 1)
         bounds = self._action_bounds().to(self.device, self._dtype)
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
-        self._observed = {key: value.to(self._type(value), copy=True) for key, value in self._observed_of(ALL).items()}
+        seen = self._observed_of(ALL)
+        name = f"{type(self).__name__}.observe()"
+        if lost := [key for key in ("observation", "goal") if key not in seen]:
+            raise ValueError(f"{name} lacks {lost[0]}: return one, of shape ({self.num_envs}, 0) for nothing")
+        if wrong := [key for key, value in seen.items() if value.ndim != 2 or len(value) != self.num_envs]:
+            raise ValueError(
+                f"{wrong[0]} of {name} has shape {tuple(seen[wrong[0]].shape)}: return ({self.num_envs}, numbers)"
+            )
+        self._observed = {key: value.to(self._type(value), copy=True) for key, value in seen.items()}
         observed = {key: self._spec(value) for key, value in self._observed.items()}
         self.observation_spec = Composite(observed, shape=shape, device=self.device)
         self.action_spec = Bounded(low, high, dtype=self._dtype, device=self.device)
@@ -408,4 +416,5 @@ class CharacterEnv(EnvBase):
     @property
     def metric_names(self) -> dict[str, list[str]]:
         """Observations that are metrics and not inputs of the policy: the names of the entries of each key."""
-        return {key: [key] for key in self._observed if key not in ("observation", "goal")}
+        widths = {key: value.shape[-1] for key, value in self._observed.items() if key not in ("observation", "goal")}
+        return {key: [key] if n == 1 else [f"{key}_{i}" for i in range(n)] for key, n in widths.items()}

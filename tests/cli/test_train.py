@@ -135,6 +135,7 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
         (["seed=range(0,3)"], "seed=range(0,3) has several values: add --multirun"),
         (["hydra/launcher=ray"], "pip install 'torchrl-mcp[ray-launcher]'"),
         (["run_dir=runs/größe"], """without quotes: write 'run_dir="runs/größe"'"""),
+        (["run_dir=~/größe"], f"""without quotes: write 'run_dir="{Path.home()}/größe"'"""),
         (["resume=a=b"], """without quotes: write 'resume="a=b"'"""),
         (["sead=3"], "the nearest are: seed"),
     ],

@@ -55,6 +55,29 @@ def test_a_reward_or_an_end_of_another_shape_is_named(method):
         step(wrong())
 
 
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        ({"goal": None}, r"Wrong\.observe\(\) lacks goal: return one, of shape \(3, 0\) for nothing"),
+        ({"close": torch.zeros(3)}, r"close of Wrong\.observe\(\) has shape \(3,\): return \(3, numbers\)"),
+    ],
+)
+def test_observations_of_another_shape_and_missing_ones_are_named(extra, said):
+    def observe(self, ids):
+        return {key: value for key, value in (Stand.observe(self, ids) | extra).items() if value is not None}
+
+    with pytest.raises(ValueError, match=said):
+        type("Wrong", (Stand,), {"observe": observe})()
+
+
+def test_a_metric_of_several_numbers_has_a_name_for_each():
+    def observe(self, ids):
+        return Stand.observe(self, ids) | {"contacts": self.com[ids], "close": self.com[ids, :1] < 1}
+
+    env = type("Touching", (Stand,), {"observe": observe})()
+    assert env.metric_names == {"contacts": ["contacts_0", "contacts_1", "contacts_2"], "close": ["close"]}
+
+
 def test_forgotten_specs_are_named():
     with pytest.raises(RuntimeError, match=r"Stand has no specs: call make_specs\(\)"):
         Stand(finished=False).reset()

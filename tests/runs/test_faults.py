@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import zipfile
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import smoke
@@ -12,6 +14,7 @@ from omegaconf import OmegaConf
 from smoke import contents, rows
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from torchrl_mcp.envs import characters
 from torchrl_mcp.runs import build, experiment, lock, policies
 from torchrl_mcp.runs.status import status
 from torchrl_mcp.training import checkpoint, run_folder
@@ -55,6 +58,21 @@ def test_a_run_that_is_at_work_is_shown_as_running_and_nobody_joins_in(killed, t
                 join_in()
     assert status(killed).state != "running"
     assert contents(killed) == before
+
+
+def test_a_run_does_not_go_on_with_another_body(tmp_path, monkeypatch):
+    body = tmp_path / "biped.xml"
+    shutil.copy(Path(characters.__file__).parent / "biped.xml", body)
+    monkeypatch.setitem(characters.CHARACTERS, "biped", replace(characters.BIPED, file=body))
+    settings = ["task=heading", "character=biped", "method=scratch", "stage=transfer", SHORT]
+    run = experiment.train(configure(tmp_path / "run", *settings))
+    before = contents(run)
+    body.write_text(body.read_text() + "<!-- stronger -->")
+    with pytest.raises(ValueError, match=r"the file of character=biped was changed since .*run began: put it back"):
+        experiment.resume(run, total_frames=256)
+    with pytest.raises(ValueError, match="holds a run that differs in character"):
+        experiment.train(configure(run, *settings))
+    assert contents(run) == before
 
 
 def test_a_resume_that_fails_leaves_the_run_as_it_was(whole):

@@ -1,6 +1,7 @@
 """The lock by which others see that a run is alive."""
 
 import ast
+import errno
 import os
 import runpy
 import socket
@@ -80,6 +81,22 @@ def test_folders_that_stay_empty_do_not_stay(tmp_path):
     with lock.held(tmp_path / "run"):
         (tmp_path / "run" / "config.yaml").touch()
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.yaml"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="flock is of POSIX")
+def test_who_looks_takes_a_lock_that_a_file_opened_for_reading_may_have_over_nfs(tmp_path, monkeypatch):
+    import fcntl
+
+    def flock(file, operation, real=fcntl.flock):
+        writable = fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY
+        if operation & fcntl.LOCK_EX and not writable:
+            raise OSError(errno.EBADF, "Bad file descriptor")  # flock(2), NFS details
+        real(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with lock.held(tmp_path):
+        assert lock.holder(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert lock.holder(tmp_path) is None
 
 
 def test_who_looks_does_not_keep_the_one_who_comes_out(tmp_path):

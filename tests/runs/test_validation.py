@@ -132,6 +132,9 @@ def test_no_setting_takes_a_run_out_of_the_folder_of_runs():
         configuration.require_valid(cfg)
     cfg.run_dir = "../elsewhere"
     configuration.require_valid(cfg)
+    cfg.run_dir = "~/elsewhere"
+    with pytest.raises(ValueError, match=rf"would be a folder called ~: write run_dir={Path.home()}/elsewhere"):
+        configuration.require_valid(cfg)
 
 
 WITHOUT_RULE = {

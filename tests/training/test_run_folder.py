@@ -67,11 +67,14 @@ def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path, monkey
     run, temporary = tmp_path / "run", tmp_path / "temporary"
     kept = [run / "config.yaml", run / "checkpoints/checkpoint-000000000128.torchrl", temporary / "other/file"]
     kept.append(temporary / "torchrl-checkpoint-load-young/manifest.json")
+    kept += [run / "data/recording.bag.partial", run / "checkpoints/.git/config", run / "checkpoints/.gitignore"]
+    kept.append(run / "another_run/checkpoints/checkpoint-000000000256.torchrl.partial")
     left = [
         run / "checkpoints/.checkpoint-000000000256.torchrl.partial.stage-1f/components/0/x.memmap",
         run / "checkpoints/.checkpoint-000000000256.torchrl.partial.archive-2e",
         run / "checkpoints/checkpoint-000000000256.torchrl.partial",
         run / "evaluation.json.partial",
+        run / "csv/scalars/reward.csv.partial",
         temporary / "torchrl-checkpoint-load-old/components/x.memmap",
     ]
     for path in (*kept, *left):

@@ -13,7 +13,7 @@ import pytest
 import torch
 from smoke import SMOKE, configure, final_parts, rows
 
-from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs import CharacterEnv, Heading
 from torchrl_mcp.runs import build, experiment, policies
 from torchrl_mcp.training import checkpoint, run_folder, trainer
 from torchrl_mcp.training.collectors import LocalSource
@@ -152,6 +152,13 @@ def test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_go
         experiment.train(cfg)
     for value in final_parts(folder).values():
         assert value.isfinite().all()
+
+
+def test_a_reward_that_is_not_finite_is_the_tasks_mistake(tmp_path, monkeypatch):
+    monkeypatch.setattr(Heading, "reward", lambda env: torch.full((env.num_envs,), torch.nan))
+    cfg = configure(tmp_path / "run", "method=scratch", "task=heading", "character=biped", "stage=transfer")
+    with pytest.raises(FloatingPointError, match=r"^reward of Heading became nan or infinite in iteration 1: correct"):
+        experiment.train(cfg)
 
 
 def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypatch):

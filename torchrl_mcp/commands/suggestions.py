@@ -1,6 +1,7 @@
 """Answers to mistakes on a command line that Hydra cannot compose."""
 
 import difflib
+import os
 import shlex
 from collections.abc import Sequence
 from itertools import pairwise
@@ -85,7 +86,7 @@ def _is_readable(word: str) -> bool:
 
 def _quote(word: str) -> str:
     name, _, value = word.partition("=")
-    quoted = setting(name, value)
+    quoted = setting(name, os.path.expanduser(value))  # no shell expands ~ within a word or quotes
     if quoted == word or not _is_readable(quoted):
         return f"Hydra cannot read {word}"
     return f"Hydra cannot read {word} without quotes: write {shlex.quote(quoted)}"

@@ -104,6 +104,7 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
         records.store(folder, config)
         return folder
     require_resumable(config)
+    records.require_same_character(folder, config)
     cfg.device = device or cfg.device
     require_all(cfg)
     print(f"{folder} goes on{records.elsewhere(folder, cfg)}", flush=True)

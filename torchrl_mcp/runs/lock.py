@@ -31,7 +31,7 @@ if sys.platform == "win32":
     PLACE = 2**30
     """Offset of the locked byte: beyond the content, so that other processes can read the content."""
 
-    def _take(file: IO[str]) -> bool:
+    def _take(file: IO[str], *, shared: bool = False) -> bool:
         os.lseek(file.fileno(), PLACE, os.SEEK_SET)
         try:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
@@ -44,9 +44,9 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-    def _take(file: IO[str]) -> bool:
+    def _take(file: IO[str], *, shared: bool = False) -> bool:  # over NFS, a file that is only read takes no other
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         return True
@@ -100,7 +100,7 @@ def holder(folder: Path) -> str | None:
     """Return the holder of a run folder's lock, such as ``process 4711 on host``, or None."""
     try:
         with (folder / LOCK).open() as file:
-            return None if _take(file) else file.read() or "another process"
+            return None if _take(file, shared=True) else file.read() or "another process"
     except FileNotFoundError:
         return None
 

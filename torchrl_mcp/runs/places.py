@@ -13,6 +13,7 @@ from zipfile import ZipFile, is_zipfile
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
 
@@ -98,8 +99,13 @@ def placeless(config: Any) -> Any:
 
 
 def digests(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the :func:`digest` of every existing file or folder outside the run folder, by the name of its setting."""
-    return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()}
+    """Return the :func:`digest` of every existing file or folder outside the run folder, by the name of its setting.
+
+    ``character`` is that of the MJCF file of a character of one's own.
+    """
+    character = CHARACTERS.get(config["character"]["name"])
+    own = {"character": digest(character.file)} if character and character.file else {}
+    return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()} | own
 
 
 def digest(path: Path) -> str:

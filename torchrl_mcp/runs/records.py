@@ -94,6 +94,22 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
         )
 
 
+def require_same_character(folder: Path, config: Mapping[str, Any]) -> None:
+    """Check that a character of one's own is the one with which a run began.
+
+    Args:
+        folder: The run folder.
+        config: The run's configuration.
+
+    Raises:
+        ValueError: If its file was changed.
+    """
+    now, began = (marks.get("character") for marks in (places.digests(config), _origin(folder).get("inputs", {})))
+    if None not in (now, began) and now != began:
+        name = config["character"]["name"]
+        raise ValueError(f"the file of character={name} was changed since {folder} began: put it back, or train anew")
+
+
 def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None:
     """Write the record of a new run, after its first checkpoint.
 

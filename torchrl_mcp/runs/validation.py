@@ -100,7 +100,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         initial_states.motions motion_starts
     """,
     FLAG: """
-        progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
+        progress_bar fused entropy_bonus functional contact_forces self_collision learned_std action_noise terminate_on_fall
         terminate_when_unhealthy success_reward waypoint parts.blind on_device random_first_length restart_noise
     """,
     RANGE: """
@@ -143,6 +143,13 @@ def require_valid(config: Mapping[str, Any]) -> None:
     wrong += wrong_values(config)
     if not wrong and (schedule := config["optimizer"].get("schedule")):
         wrong += _step_size_beyond(config["step_size"]["actor"], schedule)
+    if not wrong:
+        folders = ((name, str(config[name])) for name in ("run_dir", "run_root"))
+        wrong += [
+            f"{name}={path} would be a folder called ~: write {name}={os.path.expanduser(path)}"
+            for name, path in folders
+            if path.startswith("~")
+        ]
     if not wrong and _escapes(str(config["run_dir"]), str(config["run_root"])):
         wrong.append(f"run_dir={config['run_dir']} leaves run_root={config['run_root']}: pass a run_dir")
     if wrong:

@@ -8,9 +8,8 @@ from pathlib import Path
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from torchrl_mcp.training.run_folder import METRICS, flush, replacing
+from torchrl_mcp.training.run_folder import CSV_LOGGER, METRICS, flush, replacing
 
-CSV_LOGGER = "csv/scalars"
 """Folder of the files of TorchRL's csv logger in a run folder, with lines ``step,value``."""
 
 

@@ -39,6 +39,9 @@ CHECKPOINT = "checkpoint-{:012d}.torchrl"
 PARTIAL = ".partial"
 """Suffix of the name of a file that is being written."""
 
+CSV_LOGGER = "csv/scalars"
+"""The folder of TorchRL's csv logger."""
+
 UNPACKED = "torchrl-checkpoint-load-*"
 """Folders into which TorchRL unpacks checkpoints to read them, in the system's folder for temporary files."""
 
@@ -128,10 +131,14 @@ def frames(path: Path) -> int:
 def remove_leftovers(run: Path) -> None:
     """Remove unfinished files of killed processes, and checkpoints that they unpacked.
 
-    No other process may be working on the run.
+    No other process may be working on the run. Other files stay: the folder may be the user's, or hold other runs.
     """
-    # TorchRL hides its unfinished files.
-    unfinished = [*(run / CHECKPOINTS).glob(".*"), *run.rglob(f"*{PARTIAL}")]
+    unfinished = [
+        *(path for name in (CONFIG, METRICS, EVALUATION, PROVENANCE) for path in run.glob(f"{name}{PARTIAL}")),
+        *(run / CHECKPOINTS).glob(f"checkpoint-*.torchrl{PARTIAL}"),
+        *(run / CHECKPOINTS).glob(f".checkpoint-*.torchrl{PARTIAL}.*"),  # TorchRL hides its unfinished files
+        *(run / CSV_LOGGER).rglob(f"*.csv{PARTIAL}"),
+    ]
     stale = [path for path in Path(tempfile.gettempdir()).glob(UNPACKED) if _age(path) > STALE]
     for path in unfinished + stale:
         if path.is_dir():

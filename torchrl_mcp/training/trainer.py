@@ -163,6 +163,7 @@ class Trainer:
                 start = time.perf_counter()
                 self.stopwatch.seconds.clear()
                 batch = self.source.collect()
+                self._require_finite_task(batch)
                 metrics = self._episode_metrics(batch) | diagnostics(self.actor, batch)
                 with self.stopwatch("update"):
                     warming_up = self.progress.iteration < self.warmup_batches
@@ -247,6 +248,15 @@ class Trainer:
         optimizer.step()
         optimizer.zero_grad()
         return norm
+
+    def _require_finite_task(self, batch: TensorDictBase) -> None:
+        """Check what the task returned, so that its mistakes are not taken for those of learning."""
+        returned = {key: batch[key] for key in ("observation", "goal")} | {"reward": batch["next", "reward"]}
+        if wrong := [name for name, value in returned.items() if not value.isfinite().all()]:
+            raise FloatingPointError(
+                f"{' and '.join(wrong)} of {type(self.source.env).__name__} became nan or infinite in iteration "
+                f"{self.progress.iteration + 1}: correct the task"
+            )
 
     def _require_finite(self, metrics: dict[str, float]) -> None:
         for key, value in metrics.items():
