@@ -100,8 +100,9 @@ NAMES_BY_RULE: dict[Rule, str] = {
         initial_states.motions motion_starts
     """,
     FLAG: """
-        progress_bar fused entropy_bonus functional contact_forces self_collision learned_std action_noise terminate_on_fall
+        progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
         terminate_when_unhealthy success_reward waypoint parts.blind on_device random_first_length restart_noise
+        action_noise
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
