@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal, kl_divergence
 
-from torchrl_mcp.distributions import AdditiveGaussian
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 
 GRID = torch.linspace(-12, 12, 801, dtype=torch.float64)
 
@@ -188,3 +188,14 @@ def test_kl_divergence_has_the_value_and_the_gradient_of_the_integral(action_dim
 def test_kl_divergence_broadcasts_and_is_zero_to_itself():
     policy = AdditiveGaussian(*random_primitives(5))
     torch.testing.assert_close(kl_divergence(policy, policy.expand((2, 5))), torch.zeros(2, 5, dtype=torch.float64))
+
+
+def test_divergences_between_a_mixture_and_a_gaussian_have_the_value_of_the_integral():
+    torch.manual_seed(0)
+    mixture = AdditiveGaussian(torch.tensor([[-1.0], [1.0]]), torch.tensor([[0.5], [0.8]]), torch.tensor([0.3, 0.7]))
+    gaussian = MultiplicativeGaussian(torch.tensor([[0.4]]), torch.tensor([[1.1]]), torch.ones(1))
+    x = torch.linspace(-12, 12, 40_001).unsqueeze(-1)
+    for p, q in ((mixture, gaussian), (gaussian, mixture)):
+        exact = torch.trapezoid(p.log_prob(x).exp() * (p.log_prob(x) - q.log_prob(x)), x.squeeze(-1))
+        drawn = kl_divergence(p.expand((20_000,)), q).mean()
+        torch.testing.assert_close(drawn, exact, atol=0.02, rtol=0.0)

@@ -16,6 +16,10 @@ def distribution_class(request):
 BAD_SHAPES = {
     "scale of another length": ({"scale": torch.ones(3, 5)}, r"loc \(3, 2\), scale \(3, 5\).* do not broadcast.*\*B"),
     "gates of another length": ({"gates": torch.ones(4)}, r"gates \(4,\) do not broadcast.*\(\*B, K\)"),
+    "a key that TorchRL did not find": (
+        {"gates": None},
+        "gates is None, must be a tensor. TorchRL passes",
+    ),
     "no primitive dimension": ({"loc": torch.zeros(2)}, r"loc \(2,\).* lack a dimension for the primitives"),
     "gates without a dimension": ({"gates": torch.tensor(1.0)}, r"gates \(\) lack a dimension for the primitives"),
     "one gate for all": ({"gates": torch.ones(1)}, r"gates \(1,\) do not have a gate for each primitive"),
@@ -68,7 +72,7 @@ def test_a_mixture_refuses_gates_that_are_all_zero_and_a_product_does_not():
         (
             torch.zeros(5, 2),
             torch.ones(5, 2),
-            r"\(5, 2\).* do not fit 2 actions: pass numbers or tensors of shape \(A,\)",
+            r"\(5, 2\).* do not fit 2 actions: pass finite numbers or tensors of shape \(A,\)",
         ),
         (torch.zeros(3), 1.0, r"\(3,\).* do not fit 2 actions"),
     ],

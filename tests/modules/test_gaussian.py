@@ -57,9 +57,9 @@ def test_a_standard_deviation_that_learns_shrinks_where_noise_costs_reward(netwo
     assert (policy(*inputs)[1] < scale).all()
 
 
-@pytest.mark.parametrize("std", [0.0, -0.1, float("nan"), [0.1, 0.2], [0.1, -0.1, 0.1]])
+@pytest.mark.parametrize("std", [0.0, 1e-5, -0.1, float("nan"), [0.1, 0.2], [0.1, -0.1, 0.1]])
 def test_an_impossible_standard_deviation_is_refused(std):
-    with pytest.raises(ValueError, match="std must be one positive number or 3"):
+    with pytest.raises(ValueError, match="std must be one number of at least 1e-4 or 3"):
         GaussianPolicy(27, 2, 3, std=std)
 
 

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ValueOperator
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, SoftUpdate
 
 from torchrl_mcp.objectives import BoundedClipPPOLoss
 
@@ -95,3 +95,25 @@ def test_the_penalty_is_about_the_policy_of_this_very_call():
     with torch.no_grad():
         loc += 10
     assert loss(samples(INSIDE))["loss_bound"] > 100
+
+
+def test_with_a_delayed_actor_the_penalty_is_that_of_the_policy_that_learns():
+    plain, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=True, bound_coeff=10.0)
+    delayed, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=True, bound_coeff=10.0, delay_actor=True)
+    SoftUpdate(delayed, eps=0.99)
+    for parameter in plain.actor_network_params.values(True, True), delayed.actor_network_params.values(True, True):
+        next(iter(parameter)).data.add_(0.5)
+    penalties = [loss(samples(OUTSIDE))["loss_bound"] for loss in (plain, delayed)]
+    assert penalties[0] == penalties[1]
+    assert penalties[1].requires_grad
+
+
+def test_the_penalty_is_reduced_like_torchrl_s_terms_and_leaves_padding_out():
+    data = samples(OUTSIDE)
+    each, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=False, bound_coeff=10.0, reduction="none")
+    torch.testing.assert_close(each(data)["loss_bound"], torch.tensor([12.5, 0.1]))
+    total, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=False, bound_coeff=10.0, reduction="sum")
+    assert total(data)["loss_bound"].item() == pytest.approx(12.6)
+    padded, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=False, bound_coeff=10.0)
+    data["collector", "mask"] = torch.tensor([False, True])
+    assert padded(data)["loss_bound"].item() == pytest.approx(0.1)

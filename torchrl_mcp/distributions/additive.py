@@ -151,8 +151,17 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
 
 
 @register_kl(AdditiveGaussian, AdditiveGaussian)
-def _kl_additive_additive(p: AdditiveGaussian, q: AdditiveGaussian) -> Tensor:
+@register_kl(AdditiveGaussian, Independent)
+def _kl_additive(p: AdditiveGaussian, q: Distribution) -> Tensor:
     """Estimate the divergence like :meth:`AdditiveGaussian.entropy`, by one sample of noise per primitive."""
     shape = torch.broadcast_shapes(p.batch_shape, q.batch_shape)
     p, q = p.expand(shape), q.expand(shape)
     return p._expectation(lambda action: p.log_prob(action) - q.log_prob(action))
+
+
+@register_kl(Independent, AdditiveGaussian)
+def _kl_independent_additive(p: Independent, q: AdditiveGaussian) -> Tensor:
+    """Estimate the divergence by one reparametrised sample."""
+    shape = torch.broadcast_shapes(p.batch_shape, q.batch_shape)
+    action = p.expand(shape).rsample()
+    return p.log_prob(action) - q.log_prob(action)

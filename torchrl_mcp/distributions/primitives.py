@@ -72,6 +72,12 @@ def broadcast_primitives(
     Raises:
         ValueError: If an argument is malformed.
     """
+    for name, value in (("loc", loc), ("scale", scale), ("gates", gates)):
+        if value is None:
+            raise ValueError(
+                f"{name} is None, must be a tensor. TorchRL passes None for a key that a sample does not hold: let a "
+                "module before the distribution write it, or store it with the sample."
+            )
     if not isinstance(scale, Tensor):
         scale = torch.as_tensor(scale, dtype=torch.promote_types(loc.dtype, torch.float32), device=loc.device)
     shape = common_shape(loc, scale, gates)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, Self
 
 import torch
@@ -24,7 +25,8 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
 
     Floating-point actions are kept one rounding step inside the interval. The density of an action on a bound is that
     of the last action inside. The density of a sample, asked for with the same tensor, uses :math:`x` itself and has no
-    such limit, as TorchRL's losses need.
+    such limit, as TorchRL's off-policy losses need. PPO's loss sees stored actions, so that its ratios of samples on a
+    bound are not one: give it a :class:`MultiplicativeGaussian`, and let the environment clip.
 
     Args:
         loc: Primitive means before squashing, shape ``(*B, K, A)``.
@@ -36,8 +38,8 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
             Shapes are always checked.
 
     Raises:
-        ValueError: If the shapes do not match, or numbers ``low`` and ``high`` are in the wrong order. With validation
-            also for the values that :class:`MultiplicativeGaussian` refuses.
+        ValueError: If the shapes do not match, or numbers ``low`` and ``high`` are in the wrong order or infinite. With
+            validation also for the values that :class:`MultiplicativeGaussian` refuses.
 
     Reference:
         Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018, https://arxiv.org/abs/1812.05905,
@@ -61,7 +63,8 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
     ) -> None:
         composite = MultiplicativeGaussian(loc, scale, gates, validate_args)
         self.loc, self.scale, self.gates = composite.loc, composite.scale, composite.gates
-        low, high = (bound.to(composite.mean) if isinstance(bound, Tensor) else bound for bound in (low, high))
+        like = {"dtype": composite.mean.dtype, "device": composite.mean.device}
+        low, high = (float(x) if isinstance(x, Real) else torch.as_tensor(x, **like) for x in (low, high))
         check_bounds(low, high, composite.event_shape, composite._validate_args)
         super().__init__(composite, Squash(low, high), validate_args)
 
@@ -180,7 +183,9 @@ class Squash(Transform):
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the logarithm of the derivative at ``x``, of its shape."""
         size = x.abs()
-        return torch.as_tensor(self.half_width).log() + 2 * (math.log(2) - size - softplus(-2 * size))
+        width = self.half_width
+        log_width = width.log() if isinstance(width, Tensor) else math.log(width)
+        return log_width + 2 * (math.log(2) - size - softplus(-2 * size))
 
 
 def check_bounds(low: Tensor | float, high: Tensor | float, event_shape: Size, validate: bool) -> None:
@@ -189,10 +194,10 @@ def check_bounds(low: Tensor | float, high: Tensor | float, event_shape: Size, v
     Raises:
         ValueError: If they are no bounds of the actions, with the remedy.
     """
-    remedy = "pass numbers or tensors of shape (A,), each low below its high"
+    remedy = "pass finite numbers or tensors of shape (A,), each low below its high"
     shapes = [tuple(bound.shape) for bound in (low, high) if isinstance(bound, Tensor)]
     if any(shape not in [(), (1,), tuple(event_shape)] for shape in shapes):
         raise ValueError(f"bounds of shapes {shapes} do not fit {event_shape[0]} actions: {remedy}.")
-    ordered = high > low
+    ordered = (low < high) & (high - low < math.inf)
     if ordered is False or (validate and not torch._is_all_true(torch.as_tensor(ordered))):
         raise ValueError(f"low={low} is not below high={high}: {remedy}.")

@@ -91,8 +91,10 @@ def _valid(weights: Tensor) -> Tensor:
 
 def _normalised_inputs(observation_dim: int, goal_dim: int, num: int = 1024) -> tuple[Tensor, Tensor]:
     """Return states ``(num, S)`` and goals ``(num, G)`` of zero mean and unit variance, the same at every call."""
-    generator = torch.Generator().manual_seed(0)
-    return torch.randn(num, observation_dim, generator=generator), torch.randn(num, goal_dim, generator=generator)
+    generator = torch.Generator("cpu").manual_seed(0)
+    made = (torch.randn(num, size, generator=generator, device="cpu") for size in (observation_dim, goal_dim))
+    states, goals = (values.to(torch.get_default_device()) for values in made)
+    return states, goals
 
 
 def composite_actor(

@@ -44,10 +44,10 @@ class SeparateOptions(nn.Module):
         """Return mean and standard deviation, each ``(*B, A)``, of the options ``(*B)`` in the states ``(*B, S)``."""
         order = option.flatten().argsort()
         counts = option.flatten().bincount(minlength=len(self.policies)).tolist()
-        states = observation.flatten(0, -2)[order].split(counts)
+        states = observation.reshape(-1, observation.shape[-1])[order].split(counts)
         outputs = [policy(state, state[:, :0]) for policy, state in zip(self.policies, states, strict=True)]
         back = order.argsort()
-        loc, scale = (torch.cat(output)[back].unflatten(0, option.shape) for output in zip(*outputs, strict=True))
+        loc, scale = (torch.cat(output)[back].reshape(*option.shape, -1) for output in zip(*outputs, strict=True))
         return loc, scale
 
 
@@ -102,7 +102,7 @@ class WhereBeginning(nn.Module):
 
     def forward(self, observation: Tensor, goal: Tensor, begins: Tensor) -> Tensor:
         """Return scores ``(*B, K)``."""
-        scores = torch.zeros(*begins.shape, self.num_options, device=begins.device)
+        scores = torch.zeros(*begins.shape, self.num_options, dtype=torch.float32, device=begins.device)
         scores[begins] = self.scores(observation[begins], goal[begins]).float()
         return scores
 

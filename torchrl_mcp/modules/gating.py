@@ -95,8 +95,10 @@ def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
     """Return numbers of hidden units times ``width``, rounded.
 
     Raises:
-        ValueError: If a layer would have no units.
+        ValueError: If there is no layer, or one would have no units.
     """
+    if not num_cells:
+        raise ValueError("num_cells names no layer: pass the units of at least one, such as [64]")
     scaled = [round(cells * width) for cells in num_cells]
     if min(scaled) < 1:
         raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")
@@ -135,7 +137,7 @@ def gate_diagnostics(gates: Tensor, saturation: float = 0.05) -> dict[str, Tenso
     ``saturation`` of 0 or 1, where a sigmoid hardly learns. ``entropy`` (nats) and ``effective_primitives``, its
     exponential, describe the normalised weights. ``usage_k`` is the mean weight of primitive k.
     """
-    gates = gates.detach().float().flatten(0, -2)
+    gates = gates.detach().float().reshape(-1, gates.shape[-1])
     share = gates / gates.sum(-1, keepdim=True).clamp_min(torch.finfo(gates.dtype).tiny)
     entropy = torch.special.entr(share).sum(-1)
     diagnostics = {

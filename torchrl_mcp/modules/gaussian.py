@@ -27,7 +27,7 @@ class GaussianPolicy(nn.Module):
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:
-        ValueError: If ``std`` is not positive or is neither one number nor one per action.
+        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.2. https://arxiv.org/abs/1905.09808
@@ -78,8 +78,8 @@ def state_independent_scale(
         ValueError: If ``std`` is not positive or is neither one number nor one per action.
     """
     scale = torch.as_tensor(std, dtype=torch.float32)
-    if scale.numel() not in (1, action_dim) or not (scale > 0).all():
-        raise ValueError(f"std must be one positive number or {action_dim} of them, one per action, got {std}")
+    if scale.numel() not in (1, action_dim) or not (scale >= 1e-4).all():
+        raise ValueError(f"std must be one number of at least 1e-4 or {action_dim}, one per action, got {std}")
     module = AddStateIndependentNormalScale(action_dim, make_param=learned)
     with torch.no_grad():
         module.state_independent_scale.copy_(scale.log())

@@ -16,7 +16,8 @@ class RunningNormaliser(nn.Module):
     .. math:: y = \operatorname{clip}\left(\frac{x - m}{\sqrt{v + \epsilon}}, -c, c\right)
 
     The statistics are buffers that :meth:`update` changes in place, once per training iteration, so that the samples of
-    an iteration and the loss on them see the same numbers.
+    an iteration and the loss on them see the same numbers. A loss that copies a network, as
+    :class:`torchrl.objectives.SACLoss` does with its critics, does not see later updates: normalise before it.
 
     Args:
         size: Number of input features, ``F``.
@@ -68,8 +69,14 @@ class RunningNormaliser(nn.Module):
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
         """
         x = x.reshape(-1, x.shape[-1])
-        if not (within := (x.abs() <= LARGEST).all(-1)).all():
-            warnings.warn(f"{int((~within).sum())} of {len(x)} samples have features beyond {LARGEST:g}", stacklevel=2)
+        good = x.abs() <= LARGEST
+        if not (within := good.all(-1)).all():
+            features = (~good).any(0).nonzero().flatten().tolist()
+            warnings.warn(
+                f"{int((~within).sum())} of {len(x)} samples have features beyond {LARGEST:g} and are left out: scale "
+                f"features {features}, unless the simulation diverged",
+                stacklevel=2,
+            )
             x = x[within]
         if not len(x):
             return

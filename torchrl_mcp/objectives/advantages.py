@@ -20,7 +20,7 @@ class Advantages:
     are of order one for any discount.
 
     Args:
-        critic: From ``observation`` and ``goal`` to ``state_value``.
+        critic: From keys of a state, such as ``observation`` and ``goal``, to ``state_value``.
         gamma: Discount factor.
         lmbda: Decay of both estimators.
         clip: Largest absolute advantage after normalisation to zero mean and unit variance.
@@ -40,7 +40,7 @@ class Advantages:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Add ``advantage`` and ``value_target``, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
+        """Add ``advantage`` and ``value_target``, each ``(*B, T, 1)``, to trajectories of shape ``(*B, T)``."""
         value = self._values(batch)
         advantage, batch["value_target"] = self.gae(batch, value, upon_arrival(value, batch, self._values))
         batch["advantage"] = normalised(advantage, self.clip)
@@ -48,7 +48,7 @@ class Advantages:
         return batch
 
     def _values(self, states: TensorDictBase) -> Tensor:
-        return self.critic(states.select("observation", "goal"))["state_value"].float()
+        return self.critic(states.select(*self.critic.in_keys))["state_value"].float()
 
 
 class ScaledGAE:
@@ -67,7 +67,7 @@ class ScaledGAE:
         self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
     def __call__(self, batch: TensorDictBase, value: Tensor, next_value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return advantages and targets of values of trajectories ``(N, T)``, like the values ``(N, T, 1)`` each."""
+        """Return advantages and targets of values of trajectories ``(*B, T)``, like the values ``(*B, T, 1)`` each."""
         trajectories = batch.select(("next", "done"), ("next", "terminated"))
         trajectories["state_value"] = value
         trajectories["next", "state_value"] = next_value
@@ -77,20 +77,21 @@ class ScaledGAE:
 
 
 def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[TensorDictBase], Tensor]) -> Tensor:
-    """Return values of the states in which the steps of trajectories end, ``(N, T, F)``.
+    """Return values of the states in which the steps of trajectories end, ``(*B, T, F)``.
 
     They are those of the following samples. After a time limit and at the end of the batch, no sample of the same
     episode follows, and the stored next state is evaluated. After a terminated episode they have no meaning.
 
     Args:
-        values: Values of the states in which the steps begin, ``(N, T, F)``.
-        batch: The trajectories, ``(N, T)``.
+        values: Values of the states in which the steps begin, ``(*B, T, F)``.
+        batch: The trajectories, ``(*B, T)``.
         evaluate: From states ``(M,)`` to values ``(M, F)``.
     """
-    cut = batch["next", "truncated"].squeeze(-1).clone()
-    cut[:, -1] = True
-    arrived = values.roll(-1, dims=1)
-    arrived[cut] = evaluate(batch["next"][cut])
+    after = batch["next"]
+    cut = after.get("truncated", after["done"] & ~after["terminated"]).squeeze(-1).clone()
+    cut[..., -1] = True
+    arrived = values.roll(-1, dims=-2)
+    arrived[cut] = evaluate(after[cut])
     return arrived
 
 

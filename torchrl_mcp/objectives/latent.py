@@ -48,14 +48,15 @@ class LatentPPOLoss(BoundedClipPPOLoss):
         out = super().forward(tensordict)
         loc, scale = self._encoding
         prior = Normal(torch.zeros_like(loc), torch.ones_like(scale))
-        kl = kl_divergence(Normal(loc, scale), prior).sum(-1).mean()
+        kl = kl_divergence(Normal(loc, scale), prior).sum(-1)
         del self._encoding
-        return out.set("loss_latent", self.kl_coeff * kl).set("latent_kl", kl.detach())
+        out["loss_latent"] = self.kl_coeff * self._reduced(kl, tensordict)
+        return out.set("latent_kl", kl.detach().mean())
 
     def _get_cur_log_prob(
         self, tensordict: TensorDictBase, params: TensorDictParams | None = None
     ) -> tuple[Tensor, Distribution, bool]:
         outcome = super()._get_cur_log_prob(tensordict, params)
-        # The networks have just written their outputs.
-        self._encoding = [tensordict[key] for key in ENCODING]
+        if params is None:  # the networks have just written their outputs
+            self._encoding = [tensordict[key] for key in ENCODING]
         return outcome

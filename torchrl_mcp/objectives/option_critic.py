@@ -64,7 +64,7 @@ class OptionAdvantages:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Add the estimates, each ``(N, T, 1)``, to trajectories of shape ``(N, T)``."""
+        """Add the estimates, each ``(*B, T, 1)``, to trajectories of shape ``(*B, T)``."""
         option, here = batch["option"], self._criticised(batch)
         values, terminations = upon_arrival(here, batch, self._criticised).chunk(2, dim=-1)
         kept = of_option(values, option)
@@ -79,7 +79,7 @@ class OptionAdvantages:
 
     def _criticised(self, states: TensorDictBase) -> Tensor:
         """Values of all options, then their terminations, ``(*B, 2 K)``."""
-        criticised = self.critic(states.select("observation", "goal"))
+        criticised = self.critic(states.select(*self.critic.in_keys))
         return torch.cat([criticised["option_values"], criticised["terminations"]], dim=-1).float()
 
 
@@ -132,7 +132,7 @@ class OptionCriticLoss(BoundedClipPPOLoss):
         out = super().forward(tensordict)
         if "termination" in self.actor_network.out_keys:
             regret = tensordict["termination_advantage"].squeeze(-1)
-            out["loss_termination"] = (self._termination * regret).mean()
+            out["loss_termination"] = self._reduced(self._termination * regret, tensordict)
             del self._termination
         return out
 
@@ -140,7 +140,6 @@ class OptionCriticLoss(BoundedClipPPOLoss):
         self, tensordict: TensorDictBase, params: TensorDictParams | None = None
     ) -> tuple[Tensor, Distribution, bool]:
         outcome = super()._get_cur_log_prob(tensordict, params)
-        # The networks have just written their outputs.
-        if "termination" in self.actor_network.out_keys:
+        if params is None and "termination" in self.actor_network.out_keys:  # just written by the networks
             self._termination = tensordict["termination"]
         return outcome

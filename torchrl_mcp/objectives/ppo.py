@@ -20,7 +20,8 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     Args:
         actor_network: The policy.
         critic_network: The value function, or None if it has its own loss.
-        bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean.
+        bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean. Of a mixture the mean counts,
+            which may lie inside while means of primitives do not.
         bound: Largest absolute mean action, :math:`b`.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
 
@@ -48,12 +49,18 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         penalty = torch.zeros_like(out["loss_objective"])
         if self.bound_coeff:
             excess = (self._distribution.mean.abs() - self.bound).relu()
-            penalty = self.bound_coeff * excess.square().sum(-1).mean()
+            penalty = self.bound_coeff * self._reduced(excess.square().sum(-1), tensordict)
         del self._distribution
         return out.set("loss_bound", penalty)
 
     def _get_cur_log_prob(
         self, tensordict: TensorDictBase, params: TensorDictParams | None = None
     ) -> tuple[Tensor, Distribution, bool]:
-        log_prob, self._distribution, is_composite = super()._get_cur_log_prob(tensordict, params)
-        return log_prob, self._distribution, is_composite
+        log_prob, distribution, is_composite = super()._get_cur_log_prob(tensordict, params)
+        if params is None:  # with delay_actor, TorchRL also asks for the policy of the target's parameters
+            self._distribution = distribution
+        return log_prob, distribution, is_composite
+
+    def _reduced(self, errors: Tensor, samples: TensorDictBase) -> Tensor:
+        """Reduce errors ``(*B,)`` as TorchRL reduces its own: by ``reduction``, without padding."""
+        return self._reduce_loss(errors.unsqueeze(-1), samples).squeeze(-1)

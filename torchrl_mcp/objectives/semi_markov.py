@@ -49,15 +49,17 @@ class SemiMarkovAdvantages:
         """Return the C choices of trajectories ``(N, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
 
         Raises:
-            ValueError: If the trajectories hold no choice.
+            ValueError: If the trajectories hold no choice, or are not of shape ``(N, T)``.
         """
+        if batch.ndim != 2:
+            raise ValueError(f"trajectories of shape {tuple(batch.shape)} are not (N, T): reshape them")
         begins = batch["begins"]
         if not begins.any():
             raise ValueError(
                 f"no choice was made in {batch.shape[1]} steps: training.frames_per_batch / training.num_envs must be "
                 "at least the steps that a choice lasts"
             )
-        value = torch.zeros(*batch.shape, 1, device=begins.device)
+        value = torch.zeros(*batch.shape, 1, dtype=torch.float32, device=begins.device)
         value[begins] = self._values(batch[begins])
         target = self._targets(batch, value)
 
@@ -72,9 +74,9 @@ class SemiMarkovAdvantages:
         terminated, done = batch["next", "terminated"], batch["next", "done"].clone()
         done[:, -1] = True
         next_value = upon_arrival(value, batch, self._values).masked_fill(terminated, 0.0)
-        lmbda = self.lmbda * (~done).float()
+        lmbda = self.lmbda * (~done).to(value.dtype)
         ends = done | batch["begins"].roll(-1, dims=1).unsqueeze(-1)
-        reward = self.reward_scale * batch["next", "reward"]
+        reward = self.reward_scale * batch["next", "reward"].to(value.dtype)
         target = torch.empty_like(value)
         later = torch.zeros_like(value[:, 0])
         for t in reversed(range(batch.shape[1])):
@@ -83,4 +85,4 @@ class SemiMarkovAdvantages:
         return target
 
     def _values(self, states: TensorDictBase) -> Tensor:
-        return self.critic(states.select("observation", "goal"))["state_value"].float()
+        return self.critic(states.select(*self.critic.in_keys))["state_value"].float()

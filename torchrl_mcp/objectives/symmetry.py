@@ -82,7 +82,8 @@ class SymmetryLoss(nn.Module):
     def __init__(self, loss: nn.Module, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:
         super().__init__()
         _require_actions(actor)
-        self.loss, self.actor, self.mirrors, self.coeff = loss, actor, mirrors, coeff
+        self.loss, self.actor, self.coeff = loss, actor, coeff
+        self.mirrors = nn.ModuleDict(dict(mirrors))
         # Random keys, such as the noise of a latent variable, are the same on both sides: only `trained` reads them.
         self._network: Any = actor.trained if actor.drawn else actor.policy
 
