@@ -134,12 +134,22 @@ def test_adapting_again_overwrites_nothing_and_says_what_to_do(gymnast, command)
     assert before == {path: path.read_bytes() for path in folder.glob("*.*")}
 
 
-def test_the_next_commands_begin_in_the_folder_of_the_files(gymnast, command, tmp_path):
+@pytest.mark.parametrize("output", ["bodies", "my bodies"])
+def test_the_next_commands_begin_in_the_folder_of_the_files(gymnast, command, tmp_path, output):
     folder, _ = gymnast
-    arguments = (folder / "humanoid.xml", "--pose", "knee=-0.035", "--name", "athlete", "--output", "bodies")
+    arguments = (folder / "humanoid.xml", "--pose", "knee=-0.035", "--name", "athlete", "--output", output)
     done = command("character", "adapt", *arguments, cwd=tmp_path)
-    assert "Next:\n  cd bodies\n  torchrl-mcp-play" in done.stdout
-    assert (tmp_path / "bodies" / "own" / "character" / "athlete.yaml").is_file()
+    (line,) = re.findall(r"Next:\n  (cd .*)\n  torchrl-mcp-play", done.stdout)
+    assert shlex.split(line) == ["cd", output]
+    assert (tmp_path / output / "own" / "character" / "athlete.yaml").is_file()
+
+
+def test_files_are_utf_8_in_any_locale(command, tmp_path, monkeypatch):
+    (tmp_path / "humanoid.xml").write_text(HUMANOID.read_text().replace("_foot", "_fuß"), encoding="utf-8")
+    monkeypatch.setattr("io.text_encoding", lambda encoding, stacklevel=2: encoding or "latin-1")
+    command("character", "adapt", "humanoid.xml", "--name", "turner", "--pose", "knee=-0.035", cwd=tmp_path)
+    for suffix in ("xml", "py"):
+        assert "right_fuß" in (tmp_path / f"turner.{suffix}").read_bytes().decode()
 
 
 @pytest.mark.parametrize(

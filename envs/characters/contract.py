@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from torchrl_mcp.envs.characters.mirror import without_mirror_image
+from torchrl_mcp.envs.characters.mirror import APART, without_mirror_image, without_twin
 from torchrl_mcp.envs.characters.sides import SIDES, Sides, twin
 from torchrl_mcp.envs.characters.stance import collapse
 
@@ -74,6 +74,7 @@ def violations(
         *_rest(model),
         *_names(model, named, sides),
         *_symmetry(model, sides),
+        *_facing(model, sides),
         *_timestep(model),
     ]
     if not found and (failure := collapse(spec, tuple(feet))):
@@ -102,6 +103,11 @@ def colliding(model: mujoco.MjModel) -> list[int]:
     """Return the shapes of moving bodies that can collide."""
     collides = (model.geom_contype | model.geom_conaffinity) != 0
     return np.flatnonzero(collides & (model.geom_bodyid > 0)).tolist()
+
+
+def colliding_bodies(model: mujoco.MjModel) -> set[str]:
+    """Return the moving bodies with shapes that can collide."""
+    return {model.body(model.geom_bodyid[geom]).name for geom in colliding(model)}
 
 
 def joints_of(model: mujoco.MjModel, body: int) -> list[int]:
@@ -237,14 +243,33 @@ def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]], sides: Sides)
         yield Violation(f"{', '.join(alone)} has no twin on the other side ({pairs})", NAME_SIDES)
     elif not sided:
         yield Violation(f"no body's name begins or ends with a side ({pairs or 'none is known'})", NAME_SIDES)
+    elif unlike := list(without_twin(model, sides)):
+        yield Violation(f"the twin of {', '.join(unlike)} has other joints", "give both sides the same joints")
+    touching = colliding_bodies(model)
+    if bare := [name for name in named["feet"] if name in bodies and name not in touching]:
+        yield Violation(f"the feet {', '.join(bare)} have no shape that collides", "draw one, or name other feet")
 
 
 def _symmetry(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
+    names = [model.body(body).name for body in range(1, model.nbody)]
+    if all(twin(name, sides) == name for name in names):
+        return  # a violation of the names
     if crooked := list(without_mirror_image(model, sides)):
         yield Violation(
             f"the frames of {', '.join(crooked)} are no mirror images of the other side's in the rest pose",
-            "turn them: mirrored motions and symmetry would be wrong",
+            "turn them, with x forward and y to the left, or name all sides (--sides): mirrored motions would be wrong",
         )
+
+
+def _facing(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    places = {model.body(body).name: float(data.xipos[body, 1]) for body in range(1, model.nbody)}
+    for right, left in sides:
+        own = [name for name in places if name.startswith(right) or name.endswith(right)]
+        if sum(places[name] - places.get(twin(name, sides), places[name]) for name in own) > APART:
+            remedy = f"turn the root, with x forward and y to the left, or exchange the sides ({left}:{right})"
+            yield Violation(f"{', '.join(own)} of the right side are on the left", remedy)
 
 
 def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:

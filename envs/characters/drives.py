@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_mcp.envs.characters.contract import joints_of, line_of
+from torchrl_mcp.envs.characters.pose import FREE_RANGE
 
 TIMESTEP = 1 / 120
 """Seconds of a physics step."""
@@ -77,8 +78,8 @@ class Motor(NamedTuple):
 def motor(model: mujoco.MjModel, joint: int) -> Motor:
     """Read the motors of a joint.
 
-    The torque is limited by the ``forcerange`` of an actuator, or else the ``ctrlrange`` of a motor, and by the
-    ``actuatorfrcrange`` of the joint, the smaller if both do.
+    The torque is limited by the ``forcerange`` of an actuator, the ``ctrlrange`` of a motor, and the
+    ``actuatorfrcrange`` of the joint: the smallest counts.
     """
     torque, gain, damping = 0.0, 0.0, 0.0
     kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -90,12 +91,12 @@ def motor(model: mujoco.MjModel, joint: int) -> Motor:
         )
         if kp == -strength < 0:
             gain, damping = max(gain, strength * gear**2), max(damping, -kv * gear**2)
-        force = 0.0
+        forces = []
         if model.actuator_forcelimited[index]:
-            force = float(abs(model.actuator_forcerange[index]).max())
-        elif model.actuator_ctrllimited[index] and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE:
-            force = float(abs(model.actuator_ctrlrange[index]).max()) * abs(strength)
-        torque = max(torque, force * gear)
+            forces.append(float(abs(model.actuator_forcerange[index]).max()))
+        if model.actuator_ctrllimited[index] and model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE:
+            forces.append(float(abs(model.actuator_ctrlrange[index]).max()) * abs(strength))
+        torque = max(torque, min(forces, default=0.0) * gear)
     if model.jnt_actfrclimited[joint]:
         limit = float(abs(model.jnt_actfrcrange[joint]).max())
         torque = min(torque, limit) if torque else limit
@@ -182,7 +183,7 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
         steady,
         friction=float(model.dof_frictionloss[dofs].max()),
         spring=float(model.jnt_stiffness[joints].max()),
-        remark=", ".join(_remarks(model.jnt_pos[joints], limits, armature, steady)),
+        remark=", ".join(_remarks(model, joints, limits, armature, steady)),
     )
 
 
@@ -192,7 +193,12 @@ def _about_axes(axes: np.ndarray, torques: Sequence[float]) -> list[float]:
     return np.maximum(parts, min(torques)).tolist()
 
 
-def _remarks(anchors: np.ndarray, limits: Sequence[float], armature: float, steady: float) -> Iterator[str]:
+def _remarks(
+    model: mujoco.MjModel, joints: Sequence[int], limits: Sequence[float], armature: float, steady: float
+) -> Iterator[str]:
+    anchors = model.jnt_pos[joints]
+    if not model.jnt_limited[joints].all():
+        yield f"no limits in the file: {FREE_RANGE:g} rad to either side"
     if len(anchors) > 1:
         yield f"a ball for {len(anchors)} hinges"
         if (apart := float(np.linalg.norm(anchors - anchors.mean(0), axis=1).max())) > LEAST_APART:

@@ -82,10 +82,13 @@ def joint_layout(character: str) -> JointLayout:
 
 
 def _mirror(model: mujoco.MjModel, names: tuple[str, ...], sides: Sides) -> tuple[Tensor, Tensor]:
-    """Reflect y: a position changes y; a rotation, a pseudo-vector, changes x and z; left and right are exchanged."""
+    """Reflect y: a position changes y; a rotation, a pseudo-vector, changes x and z; left and right are exchanged.
+
+    A joint without a twin stays where it is: such a character has no mirror images.
+    """
     source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
     for joint, name in enumerate(names):
-        other = names.index(twin(name, sides))
+        other = names.index(twin(name, sides)) if twin(name, sides) in names else joint
         here, there = model.jnt_qposadr[joint], model.jnt_qposadr[other]
         match model.jnt_type[joint]:
             case mujoco.mjtJoint.mjJNT_FREE:

@@ -17,7 +17,12 @@ VECTOR_SIGNS = (1, -1)
 """Signs of a horizontal vector."""
 
 ALIKE = math.cos(math.radians(2))
-"""Cosine of the largest angle between a frame or a hinge and the mirror image of its twin's."""
+"""Cosine of the largest angle between a frame, a hinge or its position and the mirror image of its twin's."""
+
+APART = 0.05
+"""Largest distance in metres between a body with a joint and the mirror image of its twin, or of itself.
+
+It is twice a central body's distance from the middle, which is 2 cm at the head of Robotis' OP3."""
 
 REFLECTION = np.diag([1.0, -1.0, 1.0])
 
@@ -53,10 +58,22 @@ def mirror_signs(signs: Sequence[float]) -> Mirror:
     return Mirror(range(len(signs)), signs)
 
 
+def without_twin(model: mujoco.MjModel, sides: Sides = SIDES) -> Iterator[str]:
+    """Yield the bodies with joints whose twin is missing or has other kinds of joints.
+
+    Args:
+        model: The body alone.
+        sides: Beginnings or ends of names, right and left.
+    """
+    kinds = {model.body(body).name: _kinds(model, body) for body in range(1, model.nbody)}
+    yield from (name for name, own in kinds.items() if name and own and kinds.get(twin(name, sides)) != own)
+
+
 def without_mirror_image(model: mujoco.MjModel, sides: Sides = SIDES) -> Iterator[str]:
     """Yield the bodies whose frames or hinges, in the rest pose, are no mirror images of their twins'.
 
-    Features and motions of such a body have no mirror image by exchange and signs. Bodies without a twin are left out.
+    Features and motions of such a body have no mirror image by exchange and signs. A body whose name has no side is its
+    own twin. Bodies without a twin are left out, and places of bodies without a joint, such as sensors.
 
     Args:
         model: The body alone.
@@ -66,29 +83,46 @@ def without_mirror_image(model: mujoco.MjModel, sides: Sides = SIDES) -> Iterato
     mujoco.mj_kinematics(model, data)
     names = [model.body(body).name for body in range(model.nbody)]
     for body, name in enumerate(names[1:], start=1):
-        if (other := twin(name, sides)) not in names:
+        if not name or (other := twin(name, sides)) not in names:
             continue
         there = names.index(other)
         image, frame = REFLECTION @ data.xmat[there].reshape(3, 3) @ REFLECTION, data.xmat[body].reshape(3, 3)
         alike = (float((image * frame).sum()) - 1) / 2 > ALIKE
-        if model.body_jntnum[body] == model.body_jntnum[there] == 1:
-            joint, twins = model.body_jntadr[body], model.body_jntadr[there]
-            hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-            alike &= not hinge or abs(model.jnt_axis[joint] @ REFLECTION @ model.jnt_axis[twins]) > ALIKE
+        if kinds := _kinds(model, body):
+            place, other_place = data.xpos[[body, there]] - data.xpos[1]
+            alike &= bool(np.linalg.norm(place - REFLECTION @ other_place) < APART)
+        if kinds == _kinds(model, there) == [mujoco.mjtJoint.mjJNT_HINGE]:
+            hinges = model.body_jntadr[[body, there]]
+            (axis, other_axis), (angle, other_angle) = model.jnt_axis[hinges], model.qpos0[model.jnt_qposadr[hinges]]
+            sign = -float(axis @ REFLECTION @ other_axis)  # axes are pseudo-vectors
+            alike &= abs(sign) > ALIKE and math.cos(angle - round(sign) * other_angle) > ALIKE
         if not alike:
             yield name
 
 
+def _kinds(model: mujoco.MjModel, body: int) -> list[int]:
+    """Kinds of the joints of a body."""
+    first = model.body_jntadr[body]
+    kinds: list[int] = model.jnt_type[first : first + model.body_jntnum[body]].tolist()
+    return kinds
+
+
 def require_mirror_images(model: mujoco.MjModel, sides: Sides = SIDES) -> None:
-    """Check that each body's frame in the rest pose is the mirror image of its twin's.
+    """Check that each body's frame and joints in the rest pose are the mirror images of its twin's.
 
     Raises:
-        ValueError: If one is not.
+        ValueError: If one's are not.
     """
+    if alone := list(without_twin(model, sides)):
+        raise ValueError(
+            f"the joints of {', '.join(alone)} are missing or of other kinds on the other side: give both sides the "
+            "same, or do without mirror images"
+        )
     if crooked := list(without_mirror_image(model, sides)):
         raise ValueError(
             f"the frames of {', '.join(crooked)} are no mirror images of the other side's in the rest pose: turn them "
-            "in the body's file, or do without mirror images"
+            "in the body's file, with x forward and y to the left, say how names tell the sides apart (sides of the "
+            "Character), or do without mirror images"
         )
 
 
@@ -99,7 +133,12 @@ def mirror_bodies(names: Sequence[str], *, repeats: int = 1, sides: Sides = SIDE
         names: Names of the bodies.
         repeats: Number of consecutive observations of all bodies.
         sides: Beginnings or ends of names, right and left.
+
+    Raises:
+        ValueError: If a body has no twin.
     """
+    if alone := [name for name in names if twin(name, sides) not in names]:
+        raise ValueError(f"{', '.join(alone)} has no twin on the other side: rename it, or do without mirror images")
     size = len(BODY_SIGNS)
     twins = [names.index(twin(name, sides)) for name in names]
     once = [size * body + entry for body in twins for entry in range(size)]

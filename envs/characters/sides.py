@@ -17,8 +17,16 @@ USUAL: Sides = (
     ("FR_", "FL_"),
     ("RR_", "RL_"),
     ("HR_", "HL_"),
+    ("RF_", "LF_"),
+    ("RH_", "LH_"),
+    ("fr_", "fl_"),
+    ("hr_", "hl_"),
+    ("_fr", "_fl"),
+    ("_hr", "_hl"),
+    ("Right", "Left"),
+    ("right", "left"),
 )
-"""Pairs that makers of robots use."""
+"""Pairs that makers of robots use, the most distinct first."""
 
 
 def twin(name: str, sides: Sides = SIDES) -> str:
@@ -42,11 +50,11 @@ def twin(name: str, sides: Sides = SIDES) -> str:
 
 
 def guessed_sides(names: Iterable[str]) -> Sides:
-    """Return the usual pairs by which names come in twos, for :func:`twin`."""
+    """Return the usual pairs by which names come in twos, for :func:`twin`, without those that add none."""
     names = set(names)
-    found = []
+    found: Sides = ()
     for pair in USUAL:
-        paired = {name for name in names if twin(name, (pair,)) != name}
+        paired = {name for name in names if twin(name, found) == name != twin(name, (pair,))}
         if paired and {twin(name, (pair,)) for name in paired} == paired:
-            found.append(pair)
-    return tuple(found)
+            found += (pair,)
+    return found

@@ -166,10 +166,13 @@ class MotionClip:
         """Read a file of :meth:`save`.
 
         Raises:
-            MotionFormatError: If the file is no clip, is damaged, or has other joints than the character's model.
+            MotionFormatError: If the file is no clip, is damaged, is of a character that is not known, or has other
+                joints than the character's model.
         """
         try:
-            return cls._from_arrays(load_arrays(Path(path)))
+            return cls._from_arrays(path, load_arrays(Path(path)))
+        except MotionFormatError:
+            raise
         except UNREADABLE as error:
             raise MotionFormatError(
                 path,
@@ -177,10 +180,16 @@ class MotionClip:
             ) from error
 
     @classmethod
-    def _from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self:
+    def _from_arrays(cls, path: str | Path, arrays: Mapping[str, np.ndarray]) -> Self:
         if missing := {"character", "joints", "qpos", "fps", "loop"} - set(arrays):
             raise ValueError(f"it lacks {sorted(missing)}")
         character, joints = str(arrays["character"]), tuple(map(str, arrays["joints"]))
+        if character not in CHARACTERS:
+            raise MotionFormatError(
+                path,
+                f"is a clip of character={character!r}, and known are {', '.join(CHARACTERS)}: name the module that "
+                "adds it (torchrl-mcp-motions --module), or take clips of another character",
+            )
         if joints != (expected := joint_layout(character).names):
             raise ValueError(f"it has the joints {joints}, and {character}'s model has {expected}")
         return cls(character, torch.from_numpy(arrays["qpos"]), float(arrays["fps"]), loop=bool(arrays["loop"]))

@@ -27,12 +27,15 @@ class ContactPoints(NamedTuple):
 
 
 def contact_points(character: str, body: str, states: BodyStates) -> ContactPoints:
-    """Return the contact points of one body.
+    """Return the contact points of one body, of its shapes that can collide.
 
     Args:
         character: Name of the character.
         body: Name of the body.
         states: States of all bodies, from :func:`~torchrl_mcp.envs.characters.kinematics.body_states`, T frames.
+
+    Raises:
+        ValueError: If none of its shapes can collide.
     """
     offsets, radii = _outline(character_model(character), body)
     index = body_names(character).index(body)
@@ -53,6 +56,8 @@ def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
     owner = model.body(body)
     for index in range(owner.geomadr[0], owner.geomadr[0] + owner.geomnum[0]):
         geom = model.geom(index)
+        if not (geom.contype[0] or geom.conaffinity[0]):
+            continue  # decoration
         size = geom.size
         match geom.type[0]:
             case mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -65,4 +70,6 @@ def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
         mujoco.mju_quat2Mat(matrix, geom.quat)
         points.append(geom.pos + local @ matrix.reshape(3, 3).T)
         radii.append(np.full(len(local), radius))
+    if not points:
+        raise ValueError(f"{body} has no shape that collides: draw one, or name other feet")
     return torch.from_numpy(np.concatenate(points)), torch.from_numpy(np.concatenate(radii))

@@ -175,6 +175,16 @@ def test_inspect_shows_the_strides_of_people_if_asked_to(run):
     assert turn.split()[-1] == "-"  # without arms
 
 
+def test_suffixes_may_be_capital_and_lists_may_have_blanks(run, tmp_path):
+    trex_walk(1.0, 0.0).save("walk.npz")
+    (tmp_path / "walk.npz").rename(tmp_path / "WALK.NPZ")
+    assert run("inspect", "WALK.NPZ")[1].splitlines()[1].split()[:2] == ["WALK", "trex"]
+    clip = stride("biped", 1.0, 0.3, strides=1)
+    np.savetxt("walk.csv", clip.qpos.numpy(), delimiter=",")
+    words = ("walk.csv", "--character", "biped", "--fps", clip.fps, "--joints", ", ".join(clip.layout.names[1:]))
+    assert run("inspect", *words)[::2] == (0, "")
+
+
 def test_a_clip_without_strides_is_said_to_have_none(run, tmp_path):
     (tmp_path / "stand.txt").write_text(motion(1.0, speed=0.0))
     assert run("inspect", "stand.txt", "--strides")[1].splitlines()[-1].split() == ["stand", "0", *["-"] * 10]
@@ -304,6 +314,7 @@ WRONG = {
     "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
+    "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' is no duration: pass more than 0 seconds"),
     "same name": (["inspect", "stand.txt", "more/stand.txt"], "two files are called stand"),
     "missing folder": (["build-paper-corpus", "nowhere"], "nowhere lacks"),
 }

@@ -97,7 +97,9 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--strides", action="store_true", help="add length, cadence, width and more of human strides")
     command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
-    command.add_argument("--seconds", type=float, default=10.0, help="maximum length of the film (default %(default)s)")
+    command.add_argument(
+        "--seconds", type=_seconds, default=10.0, help="maximum length of the film (default %(default)s)"
+    )
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="render_files")
     command = commands.add_parser("build-paper-corpus", parents=[target], help="230 s of walking, from your downloads")
@@ -105,6 +107,16 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--output", type=Path, default=Path("corpus"), help="folder (default %(default)s)")
     command.set_defaults(run="build_paper_corpus")
     return parser
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not seconds > 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration: pass more than 0 seconds")
+    return seconds
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Checking files of characters, and converting other bodies into characters."""
 
 import argparse
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -99,7 +100,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     _print(found)
     print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.3g} kg. Next:")
     if folder != Path():
-        print(f"  cd {folder}")
+        print(f"  cd {shlex.quote(str(folder))}")
     print(f"  torchrl-mcp-play --agent zero --config-dir own task=heading character={name}")
     print(f"  torchrl-mcp-train --config-dir own task=heading character={name} method=scratch")
     return bool(found)
@@ -167,7 +168,7 @@ def _write(written: dict[Path, str]) -> None:
             raise ValueError(f"{path} is there already: pass another --name or --output, or remove it")
     for path, text in written.items():
         with replacing(path) as partial:
-            partial.write_text(text)
+            partial.write_text(text, encoding="utf-8")
         print(path)
 
 
@@ -186,5 +187,6 @@ def _sides(model: mujoco.MjModel, given: Sequence[tuple[str, str]] | None) -> Si
 
 def _verdict(path: Path, found: Sequence[Violation], feet: Sequence[str]) -> str:
     if found:
-        return f"{path}: {len(found)} violations. torchrl-mcp-character adapt {path} --name NAME converts what can be"
+        command = f"torchrl-mcp-character adapt {shlex.quote(str(path))} --name NAME"
+        return f"{path}: {len(found)} violations. {command} converts what can be"
     return f"{path} is a character, with {', '.join(feet)} as feet"

@@ -146,7 +146,8 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
     bodies = read_key_map(arguments.bodies) if arguments.bodies else None
     for path in arguments.files:
         try:
-            own = str(Archive(path).array("character")) if path.suffix == ".npz" and _is_clip(path) else HUMANS[0]
+            archived = path.suffix.lower() == ".npz" and _is_clip(path)
+            own = str(Archive(path).array("character")) if archived else HUMANS[0]
             motion = imported(
                 path,
                 arguments.character or own,
@@ -160,7 +161,7 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
                 asf=arguments.asf,
                 body_model=arguments.body_model,
                 quaternion=arguments.quaternion,
-                joints=arguments.joints.split(",") if arguments.joints else None,
+                joints=[name.strip() for name in arguments.joints.split(",")] if arguments.joints else None,
                 bodies=bodies,
             )
         except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:

@@ -13,7 +13,6 @@ from zipfile import ZipFile, is_zipfile
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
 
@@ -103,6 +102,8 @@ def digests(config: Mapping[str, Any]) -> dict[str, str]:
 
     ``character`` is that of the MJCF file of a character of one's own.
     """
+    from torchrl_mcp.envs.characters import CHARACTERS  # imports MuJoCo, which no --help needs
+
     character = CHARACTERS.get(config["character"]["name"])
     own = {"character": digest(character.file)} if character and character.file else {}
     return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()} | own

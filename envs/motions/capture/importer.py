@@ -16,7 +16,14 @@ from torchrl_mcp.envs.motions.capture.bvh import read_bvh
 from torchrl_mcp.envs.motions.capture.clips import as_source
 from torchrl_mcp.envs.motions.capture.deepmimic import read_deepmimic
 from torchrl_mcp.envs.motions.capture.inverse_kinematics import solved
-from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS, QUATERNIONS, JointMotion, assembled, closed
+from torchrl_mcp.envs.motions.capture.joint_motion import (
+    HUMANS,
+    QUATERNIONS,
+    JointMotion,
+    assembled,
+    closed,
+    require_frames,
+)
 from torchrl_mcp.envs.motions.capture.key_bodies import key_map
 from torchrl_mcp.envs.motions.capture.qpos import read_qpos
 from torchrl_mcp.envs.motions.capture.recording import record
@@ -213,7 +220,10 @@ def _of_clip(
         if joint_map or bodies:
             raise ValueError(f"{path} is of character={character} already, and needs no map: leave it out")
         clip = clip.section(skip / clip.fps, clip.duration) if skip else clip
-        return Import(clip if rate is None else clip.resampled(rate))
+        if rate is not None:
+            require_frames(clip.duration, rate)
+            clip = clip.resampled(rate)
+        return Import(clip)
     parts = key_map(clip.character, joint_map)
     followers = {} if character in HUMANS else key_map(character, bodies)
     followers = {part: body for part, body in followers.items() if part in parts}

@@ -79,15 +79,28 @@ def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[Moti
         ValueError: If fewer than two frames would remain at this rate.
     """
     duration = float(motion.times[-1])
-    steps = round(duration * rate) if 0 < rate <= HIGHEST_RATE else 0
-    if steps < 1:
-        raise ValueError(
-            f"rate={rate} leaves less than two frames of {duration:g} s: pass a higher one, up to {HIGHEST_RATE:g}"
-        )
+    require_frames(duration, rate)
+    steps = round(duration * rate)
     frames = np.interp(np.linspace(0, duration, steps + 1), motion.times.numpy(), np.arange(len(motion.times)))
     qpos, cut = states(character, motion)
     by_frame = MotionClip(character, grounded(character, qpos), fps=1.0)
     return MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, motion.loop), cut
+
+
+def require_frames(duration: float, rate: float) -> None:
+    """Check that a motion has two frames or more.
+
+    Args:
+        duration: Duration in seconds.
+        rate: Frames per second.
+
+    Raises:
+        ValueError: If fewer than two frames would remain, or the rate is too high.
+    """
+    if not 0 < rate <= HIGHEST_RATE or round(duration * rate) < 1:
+        raise ValueError(
+            f"rate={rate} leaves less than two frames of {duration:g} s: pass a higher one, up to {HIGHEST_RATE:g}"
+        )
 
 
 def closed(motion: JointMotion) -> JointMotion:

@@ -1,7 +1,7 @@
 """The bodies of any character that correspond to parts of a human body."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import yaml  # type: ignore[import-untyped]
@@ -58,7 +58,7 @@ def read_key_map(path: str | Path) -> dict[str, str]:
         ValueError: If the file is no such map.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text())
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(content, dict) or not all(isinstance(word, str) for pair in content.items() for word in pair):
@@ -88,12 +88,18 @@ def _limbs(bodies: list[str], sides: Sides) -> dict[str, str]:
             if body.startswith(affix) or body.endswith(affix)
         }
         for joints in (LEG, ARM):
-            for part, kind in zip(limb(side, joints), joints, strict=True):
+            for place, (part, kind) in enumerate(zip(limb(side, joints), joints, strict=True), start=1):
+                outer = [word for other in joints[place:] for word in NAMES[other]]
                 free = [body for body in own if body not in found.values()]
-                named = [body for word in NAMES[kind] for body in free if word in own[body]]
+                named = [body for word in NAMES[kind] for body in free if _has(own[body], word, outer)]
                 if named:
                     found[part] = named[0]
     return found
+
+
+def _has(name: str, word: str, outer: Sequence[str]) -> bool:
+    """Whether a name has a word that is no part of a word for an outer part, as arm is of forearm."""
+    return word in name and not any(word in longer and longer in name for longer in outer)
 
 
 def _feet(character: str) -> dict[str, str]:

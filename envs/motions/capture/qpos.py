@@ -86,11 +86,7 @@ def read_qpos(
 
 def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
     """Read the numbers of a CSV file, and the names of all columns, if the first line has names."""
-    rows = [
-        (number, re.split(r"\s*[,;]\s*|\s+", line.strip().rstrip(",;")))
-        for number, line in enumerate(file.text.split("\n"), start=1)
-        if line.strip()
-    ]
+    rows = [(number, _words(line)) for number, line in enumerate(file.text.split("\n"), start=1) if line.strip()]
     named = bool(rows) and None in map(parsed, rows[0][1])
     names = [word.strip("\"'") for word in rows.pop(0)[1]] if named else None
     width = len(names or (rows[0][1] if rows else []))
@@ -101,6 +97,12 @@ def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
             raise file.error(f"has {len(words)} numbers, and the first line has {width}: correct it", number)
         values.append(file.numbers(words, number))
     return torch.tensor(values, dtype=torch.float64).view(len(values), width), names, None
+
+
+def _words(line: str) -> list[str]:
+    """Split a line at semicolons, beside which commas are of decimals, or else at commas and blanks."""
+    line = line.strip().rstrip(",;")
+    return re.split(r"\s*;\s*" if ";" in line else r"\s*,\s*|\s+", line)
 
 
 def _root_order(file: TextFile, names: Sequence[str], quaternion: str | None) -> str | None:

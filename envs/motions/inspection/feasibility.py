@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.contract import colliding_bodies
 from torchrl_mcp.envs.characters.joints import character_model, joint_layout
-from torchrl_mcp.envs.characters.kinematics import body_names, body_states
+from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
 from torchrl_mcp.envs.motions.inspection.crossing import legs_apart
@@ -67,8 +68,7 @@ def feasibility(clip: MotionClip) -> Feasibility:
     bearing = [down & (speed < STILL) for down, speed in zip(low, speeds, strict=True)]
     lowest = min(
         float(contact_points(clip.character, body, states).positions[..., 2].min())
-        for body in body_names(clip.character)
-        if character_model(clip.character).body(body).geomnum[0]
+        for body in colliding_bodies(character_model(clip.character))
     )
     limit, limit_joint = _limits(clip)
     torque, torque_joint, imbalance = _dynamics(clip, [points.positions for points in feet], bearing)

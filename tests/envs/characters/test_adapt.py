@@ -49,6 +49,8 @@ SERVOS = "".join(
     for joint in ("hip", "knee")
 )
 
+MOTOR = '<motor joint="right_knee" gear="30" ctrlrange="-1 1"'
+
 
 def robot(**changes):
     return mujoco.MjModel.from_xml_string(ROBOT.format(**PLAIN | changes))
@@ -106,6 +108,8 @@ def test_the_ranges_of_a_balls_targets_hold_those_of_its_hinges(gymnast):
         ),
         ({"actuators": SERVOS.replace("kp", 'gear="2" kp')}, None, (4 * 500, "file")),
         ({"actuators": '<motor joint="right_knee" gear="30" ctrlrange="-1 2"/>'}, (60, "file"), None),
+        ({"actuators": f'{MOTOR} forcerange="-5 5"/>'}, (30, "file"), None),
+        ({"actuators": f'{MOTOR} forcerange="-0.5 0.5"/>'}, (15, "file"), None),
         ({"knee": 'actuatorfrcrange="-50 50"'}, (50, "file"), None),
     ],
 )
@@ -204,6 +208,14 @@ def test_what_resists_a_joint_is_kept_and_what_is_raised_is_named():
     assert joint.armature[0] > 0.001
     assert drive.remark == "armature 0.001 raised"
     assert adapted(robot(knee='armature="1"', actuators=SERVOS)).drives["right_shin"].armature == 1
+
+
+def test_a_joint_without_limits_is_pointed_out():
+    model = robot()
+    model.jnt_limited[model.joint("right_knee").id] = 0
+    drives = adapted(model).drives
+    assert drives["right_shin"].remark == "no limits in the file: 1.57 rad to either side"
+    assert drives["left_shin"].remark == ""
 
 
 def test_ranges_are_kept_and_a_rest_pose_beyond_them_is_refused():
@@ -325,6 +337,12 @@ def test_what_is_written_can_be_read_however_small(size):
         (["root", "right_leg", "left_leg"], (("right_", "left_"),)),
         (["root", "right_leg", "left_arm"], ()),
         (["root", "toe_R", "toe_L", "R_ear"], (("_R", "_L"),)),
+        (["base", "RF_HIP", "LF_HIP", "RH_HIP", "LH_HIP"], (("RF_", "LF_"), ("RH_", "LH_"))),  # ANYmal
+        (["body", "fr_hip", "fl_hip", "hr_hip", "hl_hip"], (("fr_", "fl_"), ("hr_", "hl_"))),  # Spot
+        (["torso", "abduct_fr", "abduct_fl", "knee_hr", "knee_hl"], (("_fr", "_fl"), ("_hr", "_hl"))),  # Mini Cheetah
+        (["pelvis", "left-foot", "right-foot"], (("right", "left"),)),  # Cassie
+        (["Trunk", "Shank_Left", "Shank_Right", "left_foot", "right_foot"], (("right_", "left_"), ("Right", "Left"))),
+        (["root", "right_leg", "left_leg", "upright"], (("right_", "left_"),)),
     ],
 )
 def test_sides_are_guessed_where_names_come_in_pairs(names, sides):

@@ -8,6 +8,7 @@ import pytest
 
 from torchrl_mcp.envs.characters import CHARACTERS, Character
 from torchrl_mcp.envs.characters.contract import violations
+from torchrl_mcp.envs.characters.mirror import without_mirror_image
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 GAINS = 'kp="80" kv="7" ctrlrange="-1 1"'
@@ -18,10 +19,10 @@ BODY = """
   <worldbody>{scenery}
     <body name="root" pos="0 0 {height}">{root}
       <geom type="{shape}" size="0.1 0.1 0.1" contype="{contype}"/>
-      <body name="left_leg" pos="0 0.1 0" {turn}>{joint}
+      <body name="left_leg" pos="{left_at}" {turn}>{joint}
         <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.05" contype="0"/>
       </body>
-      <body name="{right}" pos="0 -0.1 0"><joint name="{right}"/>
+      <body name="{right}" pos="{right_at}"><joint name="{right}"/>
         <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.05" contype="0"/>
       </body>
     </body>
@@ -33,6 +34,8 @@ GOOD = {
     "default": "",
     "scenery": "",
     "turn": "",
+    "left_at": "0 0.1 0",
+    "right_at": "0 -0.1 0",
     "height": 0.55,
     "root": "<freejoint/>",
     "shape": "sphere",
@@ -77,6 +80,11 @@ WRONG = {
         {"joint": '<joint name="left_leg" axis="0 1 1"/>'},
         "the frames of left_leg, right_leg are no mirror images",
     ),
+    "zeros": (
+        {"joint": '<joint name="left_leg" ref="30"/>'},
+        "the frames of left_leg, right_leg are no mirror images",
+    ),
+    "welded on one side": ({"joint": "", "actuator": ""}, "the twin of right_leg has other joints"),
     "defaults": ({"default": '<default><geom condim="1"/></default>'}, "has defaults of geom in no class"),
 }
 
@@ -106,10 +114,35 @@ def test_defaults_of_a_class_change_no_scene():
     assert violations(spec, feet=["left_leg", "right_leg"]) == []
 
 
-@pytest.mark.parametrize(("feet", "said"), [((), "no feet are named"), (("hoof",), "feet names hoof, which it lacks")])
-def test_feet_must_be_bodies(feet, said):
-    (violation,) = found(feet=feet)
+@pytest.mark.parametrize(
+    ("feet", "said"),
+    [
+        ((), "no feet are named"),
+        (("hoof",), "feet names hoof, which it lacks"),
+        (("left_leg", "tag"), "the feet tag have no shape that collides: draw one, or name other feet"),
+    ],
+)
+def test_feet_must_be_bodies_with_shapes(feet, said):
+    (violation,) = found(feet=feet, root='<freejoint/><body name="tag"/>')
     assert said in violation
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ("-0.1 0 0", "0.1 0 0", "the frames of left_leg, right_leg are no mirror images"),  # it faces y
+        ("0 0.2 0", "0 -0.1 0", "the frames of left_leg, right_leg are no mirror images"),
+        ("0 -0.1 0", "0 0.1 0", "right_leg of the right side are on the left: turn the root, with x forward"),
+    ],
+)
+def test_left_and_right_are_on_their_sides(left, right, said):
+    (violation,) = found(left_at=left, right_at=right)
+    assert said in violation
+
+
+def test_places_may_differ_by_two_centimetres():
+    model = mujoco.MjModel.from_xml_string(BODY.format(**GOOD | {"left_at": "0.02 0.12 0"}))
+    assert list(without_mirror_image(model)) == []
 
 
 def test_a_timestep_must_divide_the_control_step():

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 
 from torchrl_mcp.envs import Carry, Dribble, Heading, Holdout, Imitation, Location
 from torchrl_mcp.envs.characters.joints import joint_layout
+from torchrl_mcp.envs.characters.mirror import mirror_bodies
 from torchrl_mcp.envs.motions import MotionLibrary, trex_corpus, turning_clips
 
 CHARACTERS = ("biped", "humanoid", "trex")
@@ -110,6 +111,11 @@ def test_a_mirror_image_of_a_mirror_image_is_what_it_was(task, character):
     for key, mirror in env.mirrors().items():
         numbers = torch.randn(3, sizes.get(key, env.action_spec.shape[-1]))
         assert torch.equal(mirror(mirror(numbers)), numbers)
+
+
+def test_a_body_without_a_twin_is_named_where_observations_are_mirrored():
+    with pytest.raises(ValueError, match="left_camera has no twin on the other side: rename it, or do without"):
+        mirror_bodies(["root", "left_camera"])
 
 
 def test_the_ant_has_no_mirror_image():

@@ -209,6 +209,12 @@ def test_a_file_with_other_joints_is_refused_by_name(tmp_path):
         MotionClip.load(edited(clip, tmp_path, joints=swapped))
 
 
+def test_a_clip_of_a_character_that_is_not_known_asks_for_its_module(tmp_path):
+    with pytest.raises(MotionFormatError, match=r"clip.npz: is a clip of character='lizard', .* --module") as caught:
+        MotionClip.load(edited(random_clip()[0], tmp_path, character=np.array("lizard")))
+    assert "no motion clip" not in str(caught.value)
+
+
 def test_a_file_without_a_part_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"lacks \['fps'\]"):
         MotionClip.load(edited(random_clip()[0], tmp_path, fps=None))

@@ -25,6 +25,12 @@ def test_a_clip_of_the_same_character_keeps_its_loop_and_has_the_frame_rate_aske
     torch.testing.assert_close(found.at(times), clip.at(times), atol=2e-3, rtol=0)
 
 
+@pytest.mark.parametrize("rate", [0.0, -5.0, 0.01, 1e9])
+def test_a_rate_that_leaves_no_frames_is_refused(file, rate):
+    with pytest.raises(ValueError, match=rf"rate={rate} leaves less than two frames of"):
+        import_motion(file, "humanoid", rate=rate)
+
+
 def test_frames_are_left_out_at_its_beginning(file):
     clip = turning_clips("humanoid")["left_sharp"]
     found = import_motion(file, "humanoid", rate=clip.fps, skip=5)

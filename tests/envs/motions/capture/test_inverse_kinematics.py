@@ -16,7 +16,7 @@ from torchrl_mcp.envs.motions.capture.clips import as_source
 from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.capture.inverse_kinematics import solved
 from torchrl_mcp.envs.motions.capture.joint_motion import states
-from torchrl_mcp.envs.motions.capture.key_bodies import PARTS, key_map, read_key_map
+from torchrl_mcp.envs.motions.capture.key_bodies import PARTS, _limbs, key_map, read_key_map
 from torchrl_mcp.envs.motions.capture.recording import record
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
@@ -103,6 +103,23 @@ def test_joints_stay_within_their_limits_and_feet_on_the_ground(trex):
 def test_the_map_of_bodies_is_guessed_from_names(trex):
     assert dict(trex.bodies) == TREX_MAP == key_map("trex")
     assert key_map("humanoid") == {part: part for part in PARTS}
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (["shoulder_pitch", "elbow", "forearm", "hand"], ["shoulder_pitch", "elbow", "hand"]),
+        (["collar", "upper_arm", "forearm", "wrist"], ["upper_arm", "forearm", "wrist"]),
+        (["shoulder", "arm", "forearm", "hand"], ["arm", "forearm", "hand"]),
+    ],
+)
+def test_a_forearm_is_no_upper_arm(names, found):
+    arms = [f"{side}_{name}" for side in ("right", "left") for name in names]
+    assert list(_limbs(["root", *arms], (("right_", "left_"),)).items()) == [
+        (f"{side}_{part}", f"{side}_{body}")
+        for side in ("right", "left")
+        for part, body in zip(("shoulder", "elbow", "wrist"), found, strict=True)
+    ]
 
 
 def test_a_map_of_the_user_replaces_guesses(walk_file, tmp_path):

@@ -8,6 +8,7 @@ import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
+from torchrl_mcp.envs.motions.capture.joint_motion import grounded
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import walk
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
@@ -46,6 +47,22 @@ def test_nothing_speaks_against_standing(character):
 
 def test_depth_below_the_ground_is_found():
     assert feasibility(posed(shift=(0, 0, -0.013))).penetration == pytest.approx(0.013, abs=1e-9)
+
+
+def test_decoration_neither_stands_nor_sinks(tmp_path, monkeypatch):
+    """A box five centimetres below a sole, which collides with nothing, and then the sole itself made such a shape."""
+    text = files("torchrl_mcp.envs.characters").joinpath("biped.xml").read_text()
+    sole, decoration = '<geom name="left_ankle" material="left"', 'contype="0" conaffinity="0"'
+    box = f'<geom type="box" size="0.02 0.02 0.02" pos="0 0 -0.1" mass="0" {decoration}/>'
+    for name, drawn in (("decorated", f"{box}{sole}"), ("footless", f"{sole} {decoration}")):
+        assert sole in text
+        (tmp_path / f"{name}.xml").write_text(text.replace(sole, drawn))
+        monkeypatch.setitem(CHARACTERS, name, replace(CHARACTERS["biped"], name=name, file=tmp_path / f"{name}.xml"))
+    clip = posed("decorated")
+    assert feasibility(clip) == feasibility(posed("biped"))
+    torch.testing.assert_close(grounded("decorated", clip.qpos), clip.qpos)
+    with pytest.raises(ValueError, match="left_ankle has no shape that collides: draw one, or name other feet"):
+        grounded("footless", clip.qpos)
 
 
 def test_height_above_the_ground_is_no_support():
