@@ -1,4 +1,4 @@
-"""Action distributions composed of K Gaussian primitives; they need torch and nothing else."""
+"""Action distributions composed of K Gaussian primitives; they use torch alone."""
 
 from torchrl_mcp.distributions.additive import AdditiveGaussian
 from torchrl_mcp.distributions.multiplicative import MultiplicativeGaussian

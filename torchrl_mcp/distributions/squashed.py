@@ -63,8 +63,11 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
     ) -> None:
         composite = MultiplicativeGaussian(loc, scale, gates, validate_args)
         self.loc, self.scale, self.gates = composite.loc, composite.scale, composite.gates
-        like = {"dtype": composite.mean.dtype, "device": composite.mean.device}
-        low, high = (float(x) if isinstance(x, Real) else torch.as_tensor(x, **like) for x in (low, high))
+        dtype, device = composite.mean.dtype, composite.mean.device
+        low, high = (
+            float(bound) if isinstance(bound, Real) else torch.as_tensor(bound, dtype=dtype, device=device)
+            for bound in (low, high)
+        )
         check_bounds(low, high, composite.event_shape, composite._validate_args)
         super().__init__(composite, Squash(low, high), validate_args)
 
@@ -126,8 +129,9 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
         mean, stddev = self.base_dist.mean, self.base_dist.stddev
         noise = torch.linspace(-6, 6, 97, dtype=mean.dtype, device=mean.device)
         weights = (-noise.square() / 2).softmax(0)
-        actions = self.transforms[0]._call(mean + stddev * noise.view(-1, *[1] * mean.ndim))
-        return torch.tensordot(weights, function(actions), 1)
+        noise, weights = (x.view(-1, *[1] * mean.ndim) for x in (noise, weights))
+        actions = self.transforms[0]._call(mean + stddev * noise)
+        return (weights * function(actions)).sum(0)  # a matrix product would lose precision under autocast
 
 
 class Squash(Transform):
@@ -164,7 +168,7 @@ class Squash(Transform):
     def __eq__(self, other: object) -> bool:
         """Whether the other has the same bounds: then a divergence is that before squashing."""
         return isinstance(other, Squash) and all(
-            torch.equal(torch.as_tensor(ours), torch.as_tensor(theirs))
+            ours is theirs or bool(torch.as_tensor(ours == theirs).all())
             for ours, theirs in ((self.low, other.low), (self.high, other.high))
         )
 

@@ -46,8 +46,9 @@ def composite_parts(
             :meth:`~torchrl_mcp.modules.Primitives.rescale`.
         num_primitives: Number of primitives, ``K``.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
-        initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixer. It
-            includes the variance of each primitive and the variance between their means, and is a root mean square over
+        initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixers
+            whose deviation is proportional to that of their primitives, which squashed actions do not have. It includes
+            the variance of each primitive and the variance between their means, and is a root mean square over
             normalised states and actions.
 
     Raises:

@@ -3,10 +3,11 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
-from torch import Tensor, nn
-from torch.distributions import Categorical
+from torch import Size, Tensor, nn
+from torch.distributions import Categorical, Distribution
 
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
@@ -158,6 +159,12 @@ class EpsilonGreedy(Categorical):
         self._best = values.argmax(-1)
         best = nn.functional.one_hot(self._best, values.shape[-1])
         super().__init__(probs=(1 - epsilon) * best + epsilon / values.shape[-1])
+
+    def expand(self, batch_shape: Size | list[int] | tuple[int, ...], _instance: Distribution | None = None) -> Self:
+        """Return the same distribution over a larger batch, without copying."""
+        new = super().expand(batch_shape, self._get_checked_instance(EpsilonGreedy, _instance))
+        new._best = self._best.expand(batch_shape)
+        return new
 
     @property
     def deterministic_sample(self) -> Tensor:

@@ -63,7 +63,12 @@ def restart_noise(network: nn.Module, std: float) -> None:
     Args:
         network: The network; other modules in it stay as they are.
         std: Standard deviation of all actions, in action units.
+
+    Raises:
+        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit.
     """
+    if not std >= 1e-4:
+        raise ValueError(f"std must be at least 1e-4, got {std}")
     for module in network.modules():
         if isinstance(module, AddStateIndependentNormalScale):
             module.state_independent_scale.fill_(math.log(std))
@@ -75,7 +80,7 @@ def state_independent_scale(
     """Return the module that adds standard deviations, from one for all actions or one each, to means ``(*B, A)``.
 
     Raises:
-        ValueError: If ``std`` is not positive or is neither one number nor one per action.
+        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.
     """
     scale = torch.as_tensor(std, dtype=torch.float32)
     if scale.numel() not in (1, action_dim) or not (scale >= 1e-4).all():

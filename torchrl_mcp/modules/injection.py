@@ -43,7 +43,7 @@ class InjectedPolicy(nn.Module):
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:
-        ValueError: If ``std`` is not positive or is neither one number nor one per action, or layers are missing.
+        ValueError: If ``std`` is below ``1e-4`` or is neither one number nor one per action, or layers are missing.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808

@@ -68,7 +68,7 @@ class RunningNormaliser(nn.Module):
         Reference:
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
         """
-        x = x.reshape(-1, x.shape[-1])
+        x = x.reshape(-1, x.shape[-1]).to(self.mean.dtype)
         good = x.abs() <= LARGEST
         if not (within := good.all(-1)).all():
             features = (~good).any(0).nonzero().flatten().tolist()

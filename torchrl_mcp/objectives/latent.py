@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.distributions import Distribution, Normal, kl_divergence
 
@@ -42,7 +42,9 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     ) -> None:
         super().__init__(actor_network, critic_network, **kwargs)
         self.kl_coeff = kl_coeff
+        self.out_keys = [*self.out_keys, "loss_latent", "latent_kl"]
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_latent`` to the terms of the bounded loss, and report the divergence as ``latent_kl`` in nats."""
         out = super().forward(tensordict)

@@ -1,8 +1,15 @@
 """Estimates of the option-critic from trajectories, and its losses."""
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictParams,
+    TensorDictSequential,
+)
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -32,7 +39,7 @@ class OptionAdvantages:
     times as large.
 
     Args:
-        critic: From ``observation`` and ``goal`` to ``option_values`` and ``terminations``.
+        critic: From keys of a state, such as ``observation`` and ``goal``, to ``option_values`` and ``terminations``.
         gamma: Discount factor.
         lmbda: Decay of the estimators.
         clip: Largest absolute advantage of an action after normalisation to zero mean and unit variance.
@@ -120,12 +127,23 @@ class OptionCriticLoss(BoundedClipPPOLoss):
     Args:
         actor_network: From a sample to the distribution of ``action``, and to ``termination``,
             :math:`\beta_\omega(s')`.
+        critic_network: The value function, or None if it has its own loss.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.
 
     Reference:
         Bacon, Harb and Precup, *The Option-Critic Architecture*, AAAI 2017, Theorems 1 and 2 and Algorithm 1.
         https://arxiv.org/abs/1609.05140
     """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(actor_network, critic_network, **kwargs)
+        if "termination" in self.actor_network.out_keys:
+            self.out_keys = [*self.out_keys, "loss_termination"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_termination`` to the terms of the bounded loss."""

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams, dispatch
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
@@ -42,7 +42,9 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         super().__init__(actor_network, critic_network, **kwargs)
         self.bound_coeff = bound_coeff
         self.bound = bound
+        self.out_keys = [*self.out_keys, "loss_bound"]
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_bound`` to the terms of the clipped loss."""
         out = super().forward(tensordict)

@@ -25,7 +25,7 @@ class SemiMarkovAdvantages:
     Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`.
 
     Args:
-        critic: From ``observation`` and ``goal`` to ``state_value``.
+        critic: From keys of a state, such as ``observation`` and ``goal``, to ``state_value``.
         gamma: Discount factor of one step.
         lmbda: Decay of both estimators, from choice to choice.
         clip: Largest absolute advantage after normalisation to zero mean and unit variance.
@@ -46,17 +46,15 @@ class SemiMarkovAdvantages:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return the C choices of trajectories ``(N, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
+        """Return the C choices of trajectories ``(*B, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
 
         Raises:
-            ValueError: If the trajectories hold no choice, or are not of shape ``(N, T)``.
+            ValueError: If the trajectories hold no choice.
         """
-        if batch.ndim != 2:
-            raise ValueError(f"trajectories of shape {tuple(batch.shape)} are not (N, T): reshape them")
         begins = batch["begins"]
         if not begins.any():
             raise ValueError(
-                f"no choice was made in {batch.shape[1]} steps: training.frames_per_batch / training.num_envs must be "
+                f"no choice was made in {batch.shape[-1]} steps: training.frames_per_batch / training.num_envs must be "
                 "at least the steps that a choice lasts"
             )
         value = torch.zeros(*batch.shape, 1, dtype=torch.float32, device=begins.device)
@@ -70,18 +68,19 @@ class SemiMarkovAdvantages:
         return choices
 
     def _targets(self, batch: TensorDictBase, value: Tensor) -> Tensor:
-        r"""TD(:math:`\lambda`) returns from every step, given the values where choices begin, ``(N, T, 1)`` each."""
+        r"""TD(:math:`\lambda`) returns from every step, given the values where choices begin, ``(*B, T, 1)`` each."""
         terminated, done = batch["next", "terminated"], batch["next", "done"].clone()
-        done[:, -1] = True
+        done[..., -1, :] = True
         next_value = upon_arrival(value, batch, self._values).masked_fill(terminated, 0.0)
         lmbda = self.lmbda * (~done).to(value.dtype)
-        ends = done | batch["begins"].roll(-1, dims=1).unsqueeze(-1)
+        ends = done | batch["begins"].roll(-1, dims=-1).unsqueeze(-1)
         reward = self.reward_scale * batch["next", "reward"].to(value.dtype)
         target = torch.empty_like(value)
-        later = torch.zeros_like(value[:, 0])
-        for t in reversed(range(batch.shape[1])):
-            after = torch.where(ends[:, t], torch.lerp(next_value[:, t], later, lmbda[:, t]), later)
-            target[:, t] = later = reward[:, t] + self.gamma * after
+        later = torch.zeros_like(value[..., 0, :])
+        for t in reversed(range(batch.shape[-1])):
+            bootstrapped = torch.lerp(next_value[..., t, :], later, lmbda[..., t, :])
+            after = torch.where(ends[..., t, :], bootstrapped, later)
+            target[..., t, :] = later = reward[..., t, :] + self.gamma * after
         return target
 
     def _values(self, states: TensorDictBase) -> Tensor:
