@@ -178,3 +178,19 @@ def test_numbers_and_tensors_as_bounds_have_the_same_density_in_float64(random_p
 def test_infinite_and_swapped_bounds_are_refused(random_primitives, low, high):
     with pytest.raises(ValueError, match="pass finite numbers or tensors"):
         TanhMultiplicativeGaussian(*random_primitives(), low=low, high=high)
+
+
+def test_the_mean_keeps_its_precision_under_autocast(random_primitives):
+    policy = TanhMultiplicativeGaussian(*random_primitives(5, dtype=torch.float32))
+    expected = policy.mean
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(policy.mean, expected)
+
+
+def test_bounds_are_the_same_as_numbers_and_as_tensors(random_primitives):
+    first, second = random_primitives(seed=1), random_primitives(seed=2)
+    p = TanhMultiplicativeGaussian(*first, low=-0.1, high=0.1)
+    bounds = torch.tensor([[-0.1, -0.1], [0.1, 0.1]], dtype=torch.float64)
+    q = TanhMultiplicativeGaussian(*second, *bounds)
+    expected = kl_divergence(MultiplicativeGaussian(*first), MultiplicativeGaussian(*second))
+    torch.testing.assert_close(kl_divergence(p, q), expected)

@@ -5,11 +5,12 @@ import torch
 from hydra.utils import instantiate
 from tensordict import TensorDict
 from torch import nn
+from torch.overrides import TorchFunctionMode
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 from torchrl_mcp.methods.actor import Sizes
-from torchrl_mcp.methods.mcp import composite_actor
+from torchrl_mcp.methods.mcp import _normalised_inputs, composite_actor
 from torchrl_mcp.runs.configuration import compose_run
 
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
@@ -25,6 +26,22 @@ def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives
         parts = composite(**heads, num_primitives=num_primitives, gain=gain, initial_std=0.17)
         stddev = composite_actor(parts, **heads).trained.get_dist(states(50)).stddev
         torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=tolerance)
+
+
+class GeneratorsOfTheirDevice(TorchFunctionMode):
+    """Random numbers of a device need its own generator, as on a GPU."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func is torch.randn:
+            assert torch.device(kwargs["device"]) == kwargs["generator"].device
+        return func(*args, **kwargs)
+
+
+def test_inputs_that_tell_the_initial_spread_are_drawn_for_any_default_device():
+    with GeneratorsOfTheirDevice(), torch.device("meta"):
+        states, goals = _normalised_inputs(3, 2)
+    assert states.device.type == goals.device.type == "meta"
 
 
 @pytest.mark.parametrize("method", ["mcp", "moe"])

@@ -23,6 +23,13 @@ def test_each_network_evaluates_the_states_in_which_it_acts():
             torch.testing.assert_close((loc[n, t], scale[n, t]), expected)
 
 
+def test_a_single_state_needs_no_batch_dimension():
+    options = SeparateOptions(S, A, K, policy=POLICY)
+    state = torch.randn(S)
+    expected = options.policies[2](state, torch.empty(0))
+    torch.testing.assert_close(options(state, torch.tensor(2)), expected)
+
+
 def test_a_network_that_acts_nowhere_gets_no_gradient():
     options = SeparateOptions(S, A, K, policy=POLICY)
     loc, _ = options(torch.randn(N, S), torch.randint(0, K - 1, (N,)))
@@ -48,6 +55,26 @@ def test_scores_are_evaluated_only_where_an_option_begins():
     assert scores.seen == 2
     assert not found[1].any()
     assert torch.equal(found[begins], torch.cat([observation, goal], -1)[begins])
+
+
+def test_scores_stay_float32_if_the_default_is_float64():
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = WhereBeginning(lambda observation, goal: observation, K)(
+            torch.ones(3, K), torch.ones(3, 1), torch.tensor([True, False, True])
+        )
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.dtype == torch.float32
+    assert found.sum(-1).tolist() == [K, 0, K]
+
+
+def test_choices_expand_to_larger_batches():
+    choice = EpsilonGreedy(torch.tensor([[0.0, 3.0, 1.0], [5.0, -1.0, 2.0]]), 0.3)
+    larger = choice.expand((4, 2))
+    assert larger.sample((5,)).shape == (5, 4, 2)
+    assert torch.equal(larger.probs, choice.probs.expand(4, 2, 3))
+    assert torch.equal(larger.deterministic_sample, torch.tensor([[1, 0]] * 4))
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])

@@ -115,9 +115,10 @@ def test_diagnostics_are_scalars_for_any_batch_and_carry_no_gradient():
     assert gate_diagnostics(torch.tensor([0.25, 0.75]))["sum"] == 1
 
 
-def test_a_gate_without_layers_is_refused():
-    with pytest.raises(ValueError, match=r"num_cells names no layer: pass the units of at least one, such as \[64\]"):
-        JointGating(3, 2, 4, num_cells=())
+@pytest.mark.parametrize("num_cells", [(), [], 64])
+def test_a_gate_without_a_list_of_layers_is_refused(num_cells):
+    with pytest.raises(ValueError, match=r"is no list of layers: pass the units of at least one, such as \[64\]"):
+        JointGating(3, 2, 4, num_cells=num_cells)
 
 
 def test_the_width_of_saturation_is_an_argument():

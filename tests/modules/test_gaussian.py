@@ -63,6 +63,11 @@ def test_an_impossible_standard_deviation_is_refused(std):
         GaussianPolicy(27, 2, 3, std=std)
 
 
+def test_noise_that_begins_anew_below_torchrl_s_limit_is_refused():
+    with pytest.raises(ValueError, match="std must be at least 1e-4, got 1e-05"):
+        restart_noise(GaussianPolicy(5, 2, 3), 1e-5)
+
+
 @pytest.mark.parametrize("learned", [True, False])
 def test_noise_that_begins_anew_has_the_standard_deviation_given_and_the_same_mean(learned):
     policy = GaussianPolicy(5, 2, 3, std=0.02, learned_std=learned)

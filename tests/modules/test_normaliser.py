@@ -100,3 +100,12 @@ def test_a_sample_out_of_all_bounds_leaves_the_statistics_alone_and_is_told(outl
     with pytest.warns(UserWarning, match="1 of 1 samples"):
         normaliser.update(spoilt[-1:])
     assert normaliser.count == 100
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_statistics_have_the_precision_of_the_buffers_whatever_the_samples_have(dtype):
+    x = (5 + torch.randn(1000, 2, generator=torch.Generator().manual_seed(0))).to(dtype)
+    normaliser = RunningNormaliser(2)
+    normaliser.update(x)
+    variance, mean = torch.var_mean(x.double(), dim=0, correction=0)
+    torch.testing.assert_close((normaliser.mean, normaliser.variance), (mean.float(), variance.float()))

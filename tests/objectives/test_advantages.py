@@ -229,13 +229,6 @@ def test_trajectories_may_have_any_batch_dimensions():
     torch.testing.assert_close(single, expected["value_target"][1])
 
 
-def test_choices_of_other_batch_dimensions_are_refused():
-    batch = trajectories([[CONTINUES] * 3] * 2, seed=0).set("begins", torch.ones(2, 3, dtype=torch.bool))
-    estimate = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)
-    with pytest.raises(ValueError, match=r"of shape \(1, 2, 3\) are not \(N, T\): reshape them"):
-        estimate(batch[None])
-
-
 def test_the_critic_s_own_keys_are_read_and_a_missing_truncation_is_an_end_without_termination():
     batch = trajectories([[CONTINUES, TRUNCATED, TERMINATED, CONTINUES]], seed=0)
     expected = Advantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)(batch.clone())["value_target"]
@@ -244,12 +237,3 @@ def test_the_critic_s_own_keys_are_read_and_a_missing_truncation_is_an_end_witho
     other = TensorDictModule(Value(), in_keys=["observation", "wish"], out_keys=["state_value"])
     found = Advantages(other, gamma=0.9, lmbda=0.8, clip=4.0)(renamed)["value_target"]
     torch.testing.assert_close(found, expected)
-
-
-def test_rewards_in_float64_are_worth_as_much_to_choices():
-    batch = trajectories([[CONTINUES, TERMINATED, CONTINUES]] * 2, seed=0)
-    batch["begins"] = torch.tensor([[True, False, True]] * 2)
-    estimate = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)
-    expected = estimate(batch.clone())["value_target"]
-    batch["next", "reward"] = batch["next", "reward"].double()
-    torch.testing.assert_close(estimate(batch)["value_target"], expected)

@@ -3,6 +3,7 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
 
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.critic import value_critic
@@ -30,6 +31,11 @@ def make(loss_class, **kwargs):
     return loss, parts, samples.select(*keys)
 
 
+def divergences(parts, samples):
+    loc, scale = parts["encoder"](*(parts[f"{key}_normaliser"](samples[key]) for key in ("observation", "goal")))
+    return ((loc.square() + scale.square() - 1) / 2 - scale.log()).sum(-1)
+
+
 @pytest.mark.parametrize("functional", [True, False])
 def test_the_loss_is_ppo_s_plus_the_weighted_mean_divergence(functional):
     loss, parts, samples = make(LatentPPOLoss, kl_coeff=0.3, functional=functional)
@@ -37,10 +43,29 @@ def test_the_loss_is_ppo_s_plus_the_weighted_mean_divergence(functional):
     report, expected = loss(samples), reference(samples)
     for key in expected.keys():  # noqa: SIM118
         torch.testing.assert_close(report[key], expected[key])
-    loc, scale = parts["encoder"](*(parts[f"{key}_normaliser"](samples[key]) for key in ("observation", "goal")))
-    divergence = ((loc.square() + scale.square() - 1) / 2 - scale.log()).sum(-1).mean()
+    divergence = divergences(parts, samples).mean()
     torch.testing.assert_close(report["latent_kl"], divergence)
     torch.testing.assert_close(report["loss_latent"], 0.3 * divergence)
+    assert {"loss_bound", "loss_latent", "latent_kl"} <= set(loss.out_keys)
+
+
+def test_with_a_delayed_actor_the_divergence_is_that_of_the_encoder_that_learns():
+    loss, parts, samples = make(LatentPPOLoss, kl_coeff=0.3, delay_actor=True)
+    SoftUpdate(loss, eps=0.99)
+    with torch.no_grad():
+        for parameter in parts["encoder"].parameters():
+            parameter.mul_(1.5)
+    report = loss(samples)
+    torch.testing.assert_close(report["loss_latent"], 0.3 * divergences(parts, samples).mean())
+    assert report["loss_latent"].requires_grad
+
+
+def test_the_divergence_is_reduced_like_torchrl_s_terms_and_leaves_padding_out():
+    loss, parts, samples = make(LatentPPOLoss, kl_coeff=0.3, reduction="none")
+    torch.testing.assert_close(loss(samples)["loss_latent"], 0.3 * divergences(parts, samples))
+    loss, parts, samples = make(LatentPPOLoss, kl_coeff=0.3)
+    samples["collector", "mask"] = torch.arange(32) < 20
+    torch.testing.assert_close(loss(samples)["loss_latent"], 0.3 * divergences(parts, samples)[:20].mean())
 
 
 @pytest.mark.parametrize("functional", [True, False])

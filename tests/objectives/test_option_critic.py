@@ -13,6 +13,7 @@ from tensordict.nn import (
 )
 from torch import nn
 from torch.distributions import Categorical
+from torchrl.objectives import SoftUpdate
 
 from torchrl_mcp.objectives import OptionAdvantages, OptionCriticLoss, OptionValueLoss
 
@@ -56,14 +57,14 @@ class Problem:
         return (self.resolvent(pi, beta) @ rewards.flatten()).view(STATES, OPTIONS)
 
 
-def tabular_loss(options):
+def tabular_loss(options, **kwargs):
     actor = ProbabilisticTensorDictSequential(
         TensorDictModule(
             options, in_keys=["observation", "option", ("next", "observation")], out_keys=["logits", "termination"]
         ),
         ProbabilisticTensorDictModule(["logits"], ["action"], distribution_class=Categorical, return_log_prob=True),
     )
-    return OptionCriticLoss(actor, **SETTINGS)
+    return OptionCriticLoss(actor, **SETTINGS | kwargs)
 
 
 def every_step():
@@ -223,3 +224,37 @@ def test_the_termination_cost_makes_options_last():
     samples["termination_advantage"] = torch.full_like(samples["termination_advantage"], 0.01)
     tabular_loss(options)(samples)["loss_termination"].backward()
     assert (options.terminations.grad > 0).all()
+
+
+def test_with_a_delayed_actor_the_terminations_that_learn_get_the_gradient():
+    options = Options()
+    samples, loss = exact_samples(Problem(), options, 0), tabular_loss(options, functional=True, delay_actor=True)
+    SoftUpdate(loss, eps=0.99)
+    with torch.no_grad():
+        options.terminations.add_(1.0)
+    ended = options.terminations.detach().sigmoid()[samples["option"], samples["next", "observation"]]
+    regret = samples["termination_advantage"].squeeze(-1)
+    report = loss(samples)
+    torch.testing.assert_close(report["loss_termination"], (ended * regret).mean())
+    report["loss_termination"].backward()
+    assert options.terminations.grad.abs().max() > 1e-3
+
+
+def test_terminations_are_reduced_like_torchrl_s_terms_and_listed():
+    options = Options()
+    samples, loss = exact_samples(Problem(), options, 0), tabular_loss(options, reduction="none")
+    ended = options.terminations.sigmoid()[samples["option"], samples["next", "observation"]]
+    expected = ended * samples["termination_advantage"].squeeze(-1)
+    assert "loss_termination" in loss.out_keys
+    torch.testing.assert_close(loss(samples)["loss_termination"], expected)
+    samples["collector", "mask"] = torch.arange(len(samples)) < 10
+    torch.testing.assert_close(tabular_loss(options)(samples)["loss_termination"], expected[:10].mean())
+
+
+def test_estimates_are_the_same_for_any_batch_dimensions():
+    batch = random_batch([[GOES_ON, TERMINATED, GOES_ON], [GOES_ON, TRUNCATED, GOES_ON]] * 2)
+    settings = {"gamma": 0.9, "lmbda": 0.8, "clip": 4.0, "epsilon": 0.2, "termination_cost": 0.01}
+    estimate = OptionAdvantages(tabular_critic(), **settings)
+    expected, found = estimate(batch.clone()), estimate(batch.reshape(2, 2, 3).clone())
+    for key in ("advantage", "value_target", "termination_advantage"):
+        torch.testing.assert_close(found[key].flatten(0, 1), expected[key])

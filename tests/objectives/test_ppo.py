@@ -117,3 +117,19 @@ def test_the_penalty_is_reduced_like_torchrl_s_terms_and_leaves_padding_out():
     padded, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=False, bound_coeff=10.0)
     data["collector", "mask"] = torch.tensor([False, True])
     assert padded(data)["loss_bound"].item() == pytest.approx(0.1)
+
+
+def test_it_takes_keywords_like_torchrl_s_and_its_terms_can_be_selected():
+    data = samples(INSIDE).exclude("advantage", "value_target")
+    for key, value in (("observation", torch.randn(2, 3)), ("reward", torch.randn(2, 1))):
+        data["next", key] = value
+    data["next", "done"] = torch.ones(2, 1, dtype=torch.bool)
+    data["next", "terminated"] = data["next", "done"]
+    theirs, _ = make(ClipPPOLoss, OUTSIDE, functional=True)
+    ours, _ = make(BoundedClipPPOLoss, OUTSIDE, functional=True, bound_coeff=10.0)
+    arguments = data.flatten_keys("_").to_dict()
+    expected, found = theirs(**arguments), ours(**arguments)
+    assert torch.equal(torch.stack(found[:-1]), torch.stack(expected))
+    assert found[-1].item() == pytest.approx(6.3)
+    ours.select_out_keys("loss_objective", "loss_bound")
+    assert set(ours(data).keys()) == {"loss_objective", "loss_bound"}

@@ -169,3 +169,31 @@ def test_a_batch_without_choices_is_refused_with_a_remedy():
     batch = trajectories([[1.0, 1.0]], [[0.0, 0.0, 0.0]], [[GOES_ON, GOES_ON]], [[False, False]])
     with pytest.raises(ValueError, match="frames_per_batch"):
         SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.9, clip=4.0)(batch)
+
+
+def two_choices_in_each_of_four_rows():
+    generator = torch.Generator().manual_seed(0)
+    rewards, values = torch.randn(4, 3, generator=generator), torch.randn(4, 4, generator=generator)
+    outcomes = [[GOES_ON, TERMINATED, GOES_ON], [GOES_ON, TRUNCATED, GOES_ON]] * 2
+    return trajectories(rewards.tolist(), values.tolist(), outcomes, [[True, False, True]] * 4)
+
+
+def test_trajectories_may_have_any_batch_dimensions():
+    batch = two_choices_in_each_of_four_rows()
+    estimate = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)
+    expected = estimate(batch)["value_target"]
+    torch.testing.assert_close(estimate(batch.reshape(2, 2, 3))["value_target"], expected)
+    torch.testing.assert_close(estimate(batch[1])["value_target"], expected[2:4])
+
+
+def test_rewards_or_a_default_in_float64_change_nothing():
+    batch = two_choices_in_each_of_four_rows()
+    estimate = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)
+    expected = estimate(batch)["value_target"]
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(estimate(batch)["value_target"], expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    batch["next", "reward"] = batch["next", "reward"].double()
+    torch.testing.assert_close(estimate(batch)["value_target"], expected)

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
-from torchrl_mcp.objectives import MirroredSamples
+from torchrl_mcp.objectives import MirroredSamples, SymmetryLoss
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
 
@@ -123,6 +124,15 @@ def test_a_symmetric_policy_pays_nothing(tmp_path):
 
     policy.forward = forward
     assert trainer.losses["actor"](samples)["loss_symmetry"] < 1e-9
+
+
+def test_reflections_move_with_the_loss_and_are_no_part_of_its_state(tmp_path):
+    agent, trainer = trainer_of(tmp_path, "symmetry=none", "method=scratch", "task=heading")
+    mirrors = trainer.source.env.mirrors()
+    loss = SymmetryLoss(nn.Identity(), agent.actor, mirrors, coeff=1.0)
+    assert not [key for key in loss.state_dict() if "mirror" in key]
+    loss.to("meta")
+    assert {buffer.device.type for mirror in mirrors.values() for buffer in mirror.buffers()} == {"meta"}
 
 
 @pytest.mark.parametrize("symmetry", ["augment", "loss"])

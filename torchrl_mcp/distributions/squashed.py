@@ -187,9 +187,7 @@ class Squash(Transform):
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the logarithm of the derivative at ``x``, of its shape."""
         size = x.abs()
-        width = self.half_width
-        log_width = width.log() if isinstance(width, Tensor) else math.log(width)
-        return log_width + 2 * (math.log(2) - size - softplus(-2 * size))
+        return torch.as_tensor(self.half_width, dtype=x.dtype).log() + 2 * (math.log(2) - size - softplus(-2 * size))
 
 
 def check_bounds(low: Tensor | float, high: Tensor | float, event_shape: Size, validate: bool) -> None:

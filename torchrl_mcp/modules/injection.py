@@ -61,9 +61,9 @@ class InjectedPolicy(nn.Module):
         output_gain: float = 0.01,
     ) -> None:
         super().__init__()
-        if len(num_cells) < 2:
-            raise ValueError(f"num_cells must name two hidden layers or more, got {list(num_cells)}")
         num_cells = scaled_cells(num_cells, width)
+        if len(num_cells) < 2:
+            raise ValueError(f"num_cells must name two hidden layers or more, got {num_cells}")
         self.input = nn.Linear(observation_dim, num_cells[0])
         self.rectifier = nn.ReLU()
         self.body = relu_mlp(num_cells[0], num_cells[1:])

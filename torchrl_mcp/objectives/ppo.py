@@ -42,7 +42,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         super().__init__(actor_network, critic_network, **kwargs)
         self.bound_coeff = bound_coeff
         self.bound = bound
-        self.out_keys = [*self.out_keys, "loss_bound"]
+        self.out_keys: list[str] = [*self.out_keys, "loss_bound"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
