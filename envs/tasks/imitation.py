@@ -121,6 +121,8 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"clip_end={clip_end!r} is unknown: pass {' or '.join(CLIP_ENDS)}")
         self.max_error, self.clip_end = max_error, clip_end
         self.terms = checked_terms(terms)
+        if "key_positions" in terms and not CHARACTERS[character].key_bodies:
+            raise ValueError(f"terms names key_positions, and character={character!r} has no key_bodies: name some")
         self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         names = library.body_names

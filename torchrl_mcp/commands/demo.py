@@ -200,7 +200,7 @@ def report(folder: Path, runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
     """Write table, numbers and learning curves, and return the table with its caption."""
     table = f"{text_table(table_rows(rows), markdown=True)}\n\n{caption(runs, rows)}"
     with replacing(folder / "results.md") as partial:
-        partial.write_text(table + "\n")
+        partial.write_text(table + "\n", encoding="utf-8")
     write_json({"rows": list(rows)}, folder / "results.json")
     curves = [learning_curve(folder, runs, name) for name in ("mcp", "scratch")]
     analysis.write_curves(curves, folder / "learning_curves.csv")

@@ -32,4 +32,4 @@ def write_page(
     environment = Environment(loader=PackageLoader("torchrl_mcp.report"), autoescape=True, undefined=StrictUndefined)
     context = {"rows": rows, "caption": caption, "film": film, "curves": curves, "commands": commands}
     with replacing(folder / PAGE) as partial:
-        partial.write_text(environment.get_template("demo.html").render(context))
+        partial.write_text(environment.get_template("demo.html").render(context), encoding="utf-8")

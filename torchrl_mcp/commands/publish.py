@@ -38,9 +38,8 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
-    card.write_text(
-        model_card(output, cfg, numbers, origin, steps=run_folder.frames(checkpoint.find(run)), limits=limits)
-    )
+    steps = run_folder.frames(checkpoint.find(run))
+    card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits), encoding="utf-8")
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
 
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -232,6 +233,13 @@ def test_a_checkpoint_knows_its_motions():
     env.set_extra_state(states[1])
     with pytest.raises(ValueError, match="trained on other motions"):
         env.set_extra_state(states[0])
+
+
+def test_a_character_without_key_bodies_has_no_positions_of_them(monkeypatch):
+    monkeypatch.setitem(CHARACTERS, "biped", replace(CHARACTERS["biped"], key_bodies=()))
+    make()
+    with pytest.raises(ValueError, match="terms names key_positions, and character='biped' has no key_bodies"):
+        make(terms={"key_positions": {"weight": 1.0, "scale": 40.0}})
 
 
 def test_motions_and_terms_are_checked():
