@@ -54,5 +54,5 @@ def test_a_network_without_a_second_layer_is_refused():
 
 @pytest.mark.parametrize("std", [0.0, -0.1, float("nan"), [0.1, 0.2]])
 def test_an_impossible_standard_deviation_is_refused(std):
-    with pytest.raises(ValueError, match="std must be one number of at least 1e-4 or 3"):
+    with pytest.raises(ValueError, match=r"std must be one number of at least 0\.0001 or 3"):
         InjectedPolicy(27, 3, std=std)

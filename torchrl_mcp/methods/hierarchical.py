@@ -93,7 +93,7 @@ def gated_actor(
         TensorDictModule(gate, in_keys=[STATE, GOAL, "begins"], out_keys=["gate_logits"]),
         choice,
         TensorDictModule(keep_option, in_keys=["begins", "option", "held_option"], out_keys=["option"]),
-        *_acting(parts, noise=action_noise),
+        *(_acting(parts) if action_noise else _playing_means(parts)),
     )
     return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
 
@@ -118,9 +118,11 @@ class Clock(nn.Module):
         return held_steps.remainder(self.steps_per_choice) == 0
 
 
-def _acting(parts: nn.ModuleDict, *, noise: bool = True) -> tuple[TensorDictModule, ...]:
-    if not noise:
-        return (TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["action", "scale"]),)
+def _playing_means(parts: nn.ModuleDict) -> tuple[TensorDictModule]:
+    return (TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["action", "scale"]),)
+
+
+def _acting(parts: nn.ModuleDict) -> tuple[TensorDictModule, TensorDictModule]:
     return (
         TensorDictModule(parts["primitives"], in_keys=[STATE, "option"], out_keys=["loc", "scale"]),
         sampler("action", IndependentNormal, loc="loc", scale="scale"),

@@ -9,6 +9,9 @@ from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 
+LEAST_STD = 1e-4
+"""Standard deviation at which TorchRL's :class:`AddStateIndependentNormalScale` clamps."""
+
 
 class GaussianPolicy(nn.Module):
     r"""A network for the mean, and a covariance without one: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
@@ -67,8 +70,8 @@ def restart_noise(network: nn.Module, std: float) -> None:
     Raises:
         ValueError: If ``std`` is below ``1e-4``, TorchRL's limit.
     """
-    if not std >= 1e-4:
-        raise ValueError(f"std must be at least 1e-4, got {std}")
+    if not std >= LEAST_STD:
+        raise ValueError(f"std must be at least {LEAST_STD:g}, got {std}")
     for module in network.modules():
         if isinstance(module, AddStateIndependentNormalScale):
             module.state_independent_scale.fill_(math.log(std))
@@ -83,8 +86,8 @@ def state_independent_scale(
         ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.
     """
     scale = torch.as_tensor(std, dtype=torch.float32)
-    if scale.numel() not in (1, action_dim) or not (scale >= 1e-4).all():
-        raise ValueError(f"std must be one number of at least 1e-4 or {action_dim}, one per action, got {std}")
+    if scale.numel() not in (1, action_dim) or not (scale >= LEAST_STD).all():
+        raise ValueError(f"std must be one number of at least {LEAST_STD:g} or {action_dim}, one per action, got {std}")
     module = AddStateIndependentNormalScale(action_dim, make_param=learned)
     with torch.no_grad():
         module.state_independent_scale.copy_(scale.log())
