@@ -59,7 +59,7 @@ class BatchSimulation(Simulation):
 
     def step(self, ctrl: Tensor) -> Tensor:
         """See :meth:`Simulation.step`."""
-        controls = ctrl.detach().numpy()
+        controls = ctrl.detach().double().numpy()  # of any precision, as from autocast
         np.copyto(self._before, self._rows)
         np.copyto(self._fields["ctrl"], controls)
         failed = self._run(self._batch.step, nstep=self.substeps, stage=self._after_step)

@@ -38,7 +38,7 @@ class Simulation(ABC):
         """Advance every simulation by the physics steps of an action.
 
         Args:
-            ctrl: Controls, shape ``(N, A)``.
+            ctrl: Controls, shape ``(N, A)``, of any floating-point type.
 
         Returns:
             Indices of the simulations that faulted, shape ``(n,)``, int64; usually none.

@@ -45,6 +45,15 @@ def test_a_step_is_that_of_plain_mujoco(ants):
             assert torch.equal(field[2], torch.as_tensor(getattr(data, name), dtype=torch.float64)), name
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_controls_may_have_any_precision(ants, dtype):
+    controls = (torch.rand(4, 8) * 2 - 1).to(dtype)
+    before = ants.state["qpos"].clone()
+    assert len(ants.step(controls)) == 0
+    assert torch.equal(ants.state["ctrl"], controls.double())
+    assert not torch.equal(ants.state["qpos"], before)
+
+
 def test_outputs_are_current_after_a_reset(ants):
     qpos = ants.state["qpos"][:2].clone()
     qpos[:, 0] = torch.tensor([3.0, 4.0])
