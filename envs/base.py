@@ -206,11 +206,22 @@ class CharacterEnv(EnvBase):
         """Wall-clock seconds spent inside MuJoCo so far."""
         return self.simulation.physics_seconds
 
+    def to(self, device: torch.device | str | int) -> "CharacterEnv":
+        """Return itself: the physics cannot move.
+
+        Raises:
+            ValueError: If ``device`` is of another type than the physics.
+        """
+        if torch.device(device).type != self.device.type:
+            raise ValueError(f"device={device}: the physics stays on {self.device}. Move what the environment emits")
+        return self
+
     def get_state(self) -> TensorDict:
         """Snapshot of the whole state except ``generator``, each entry ``(N, ...)``.
 
         ``reset(state, set_state=True)`` restores it, and the continuation is bit-identical. ``qpos`` and ``qvel`` alone
-        are a state as well: the other entries then take their values at the beginning of an episode.
+        are a state as well: the other entries then take their values at the beginning of an episode, in which the
+        character stands at the origin and faces x.
         """
         state = {**self.simulation.state, **self.episode}
         return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
@@ -332,10 +343,14 @@ class CharacterEnv(EnvBase):
         for name, place in self._tracked.items():
             self.episode[name].copy_(place)
         self.update_goal()
-        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self.truncated().unsqueeze(-1)
+        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._each("truncated").unsqueeze(-1)
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs: Any) -> TensorDict:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, seed: int | None = None
+    ) -> TensorDict:
+        if seed is not None:
+            self.set_seed(seed)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if self._snapshot is not None and mask is None and not set_state:
             snapshot, self._snapshot = self._snapshot, None
@@ -345,6 +360,9 @@ class CharacterEnv(EnvBase):
 
     def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
         """Begin episodes in the simulations ``ids``; entries that ``state`` lacks are drawn."""
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        if not len(ids):
+            return self._emit(ALL, None, no, no.clone())
         known = {*self.simulation.state, *self.episode}
         if not known <= state.keys():
             state = {**self.initial_state(len(ids)), **state}
@@ -352,7 +370,6 @@ class CharacterEnv(EnvBase):
         state = {**self._blank, **{name: place[ids] for name, place in self._tracked.items()}, **state}
         for key, memory in self.episode.items():
             memory[ids] = state[key].to(memory.dtype)
-        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return self._emit(ids if len(ids) < self.num_envs else ALL, None, no, no.clone())
 
     def _checked(self, tensordict: TensorDictBase | None, ids: Tensor) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import yaml  # type: ignore[import-untyped]
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import TensorSpec
 
 from torchrl_mcp import envs
 from torchrl_mcp.envs.base import CharacterEnv
@@ -28,6 +29,9 @@ class GymnasiumEnv(gymnasium.Env):
         render_mode: ``"rgb_array"`` to draw, or None.
         **kwargs: Passed on to the task.
 
+    Raises:
+        ValueError: If ``render_mode`` is another.
+
     Example:
         >>> import torchrl_mcp
         >>> env = gymnasium.make("torchrl_mcp/Heading-Biped-v0")
@@ -39,17 +43,18 @@ class GymnasiumEnv(gymnasium.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, task: type[CharacterEnv], *, render_mode: str | None = None, **kwargs: Any) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r} is unknown: pass rgb_array, or None")
         self._made = {"task": task, "render_mode": render_mode, **kwargs}
         self.env = task(num_envs=1, num_threads=1, **kwargs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.env.control_timestep)}
         self.render_mode = render_mode
-        spec = self.env.action_spec.space
-        self.action_space = gymnasium.spaces.Box(spec.low[0].numpy(), spec.high[0].numpy())
+        bounds = self.env.action_spec.space
+        low, high, dtype = bounds.low[0].numpy(), bounds.high[0].numpy(), _dtype(self.env.action_spec)
+        self.action_space = gymnasium.spaces.Box(low, high, dtype=dtype)
+        observed = {key: self.env.observation_spec[key] for key in ("observation", "goal")}
         self.observation_space = gymnasium.spaces.Dict(
-            {
-                key: gymnasium.spaces.Box(-np.inf, np.inf, self.env.observation_spec[key].shape[1:])
-                for key in ("observation", "goal")
-            }
+            {key: gymnasium.spaces.Box(-np.inf, np.inf, spec.shape[1:], _dtype(spec)) for key, spec in observed.items()}
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -69,6 +74,8 @@ class GymnasiumEnv(gymnasium.Env):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode, after seeding with ``seed`` if given."""
         super().reset(seed=seed)
+        if self.spec is not None and self.spec.max_episode_steps:  # an argument of gymnasium.make that it keeps
+            self.env.max_episode_steps = self.spec.max_episode_steps
         if seed is not None:
             self.env.set_seed(seed)
         outcome = self.env.reset()
@@ -76,7 +83,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Take an action."""
-        given = TensorDict({"action": torch.as_tensor(action, dtype=torch.float32).unsqueeze(0)}, [1])
+        given = TensorDict({"action": torch.as_tensor(action, dtype=self.env.action_spec.dtype).unsqueeze(0)}, [1])
         outcome = self.env.step(given)["next"]
         terminated, truncated = outcome["terminated"].item(), outcome["truncated"].item()
         return self._observed(outcome), outcome["reward"].item(), terminated, truncated, self._measured(outcome)
@@ -97,6 +104,10 @@ class GymnasiumEnv(gymnasium.Env):
 
     def _observed(self, outcome: TensorDictBase) -> dict[str, np.ndarray]:
         return {key: outcome[key][0].numpy() for key in ("observation", "goal")}
+
+
+def _dtype(spec: TensorSpec) -> type[np.floating]:
+    return np.float64 if spec.dtype is torch.float64 else np.float32
 
 
 def make(task: str, character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:

@@ -60,6 +60,29 @@ def test_setting_the_seed_again_repeats_the_trajectory():
     assert not torch.equal(first["observation"], other["observation"])
 
 
+def test_a_reset_may_give_the_seed_and_refuses_what_it_does_not_know():
+    first, other = make(seed=1), make(seed=2)
+    assert torch.equal(first.reset(seed=5)["observation"], other.reset(seed=5)["observation"])
+    with pytest.raises(TypeError, match="sead"):
+        first.reset(sead=5)
+
+
+def test_the_physics_does_not_move_to_another_device():
+    env = make()
+    assert env.to("cpu") is env
+    with pytest.raises(ValueError, match=r"device=cuda: the physics stays on cpu\. Move what"):
+        env.to("cuda")
+
+
+def test_a_reset_of_nobody_changes_nothing():
+    env = make()
+    _, carrier = play(env, env.reset(), actions(3))
+    before = env.get_state()
+    after = env.reset(carrier.set("_reset", torch.zeros(4, 1, dtype=torch.bool)))
+    assert_identical(env.get_state(), before)
+    assert torch.equal(after["observation"], carrier["observation"])
+
+
 def test_an_environment_without_a_seed_draws_one_from_torch():
     torch.manual_seed(3)
     first = make(seed=None).reset()

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.gymnasium_env import GymnasiumEnv
 
 NAMES = sorted(name for name in gymnasium.registry if name.startswith("torchrl_mcp/"))
 
@@ -82,6 +83,24 @@ def test_the_info_tells_success():
     _, info = env.reset(seed=0)
     assert info == {"success": 0.0}
     assert env.step(env.action_space.sample())[-1].keys() == {"success"}
+
+
+def test_the_time_limit_of_make_may_be_longer_than_the_tasks():
+    env = gymnasium.make("torchrl_mcp/Holdout-Ant-v0", max_episode_steps=205, terminate_when_unhealthy=False)
+    env.reset(seed=0)
+    truncated = [env.step(np.zeros(8))[3] for _ in range(205)]
+    assert (sum(truncated), truncated[-1]) == (1, True)
+
+
+def test_observations_of_double_precision_are_in_their_space():
+    env = gymnasium.make("torchrl_mcp/Holdout-Ant-v0", dtype=torch.float64)
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+    assert env.observation_space.contains(env.step(env.action_space.sample())[0])
+
+
+def test_an_unknown_render_mode_is_refused():
+    with pytest.raises(ValueError, match="render_mode='rgb' is unknown: pass rgb_array"):
+        GymnasiumEnv(Heading, character="biped", render_mode="rgb")
 
 
 def test_a_single_environment_is_the_batch_of_one():

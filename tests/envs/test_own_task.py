@@ -48,7 +48,7 @@ def test_a_curriculum_without_effect_is_refused(curriculum, said):
         Stand(curriculum=curriculum)
 
 
-@pytest.mark.parametrize("method", ["reward", "terminated"])
+@pytest.mark.parametrize("method", ["reward", "terminated", "truncated"])
 def test_a_reward_or_an_end_of_another_shape_is_named(method):
     wrong = type("Wrong", (Stand,), {method: lambda self: torch.zeros(self.num_envs, 1, dtype=torch.bool)})
     with pytest.raises(ValueError, match=rf"Wrong\.{method}\(\) has shape \(3, 1\): return \(3,\)"):

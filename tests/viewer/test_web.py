@@ -1,3 +1,4 @@
+import asyncio
 import contextlib
 import logging
 import math
@@ -169,6 +170,75 @@ def test_who_may_what(path, host, origin, address, refused):
     headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
     reason = refusal(path, headers, address)
     assert reason is None if refused is None else refused in reason
+
+
+class Connection:
+    """A browser's connection to the page at 192.0.2.7."""
+
+    local_address = ("192.0.2.7", 8080)
+
+    def __init__(self, address, *messages):
+        self.remote_address, self.messages, self.heard, self.closed = (address, 50000), messages, [], None
+
+    async def __aiter__(self):
+        for message in self.messages:
+            yield message
+
+    async def close(self, code, reason):
+        self.closed = reason
+
+
+def attendant(monkeypatch, handler):
+    """The handler of connections that Studio would call on a guarded page."""
+    monkeypatch.setattr(web_server, "serve", lambda attend, **settings: attend)
+    with guarded(HERE):
+        return web_server.serve(handler, process_request=None)
+
+
+@pytest.mark.parametrize(
+    ("address", "heard"),
+    [
+        ("127.0.0.1", ["state_ack", "force_control", b"input", "heartbeat"]),
+        ("192.0.2.7", ["state_ack", "force_control", b"input", "heartbeat"]),  # this machine, by its own address
+        ("192.0.2.9", ["state_ack", "heartbeat"]),
+    ],
+)
+def test_a_visitor_cannot_ask_for_control(monkeypatch, address, heard):
+    async def handler(connection):
+        connection.heard.extend([message async for message in connection])
+
+    connection = Connection(address, "state_ack", "force_control", b"input", "heartbeat")
+    asyncio.run(attendant(monkeypatch, handler)(connection))
+    assert connection.heard == heard
+
+
+def test_visitors_leave_room_for_this_machine(monkeypatch):
+    async def crowd():
+        end, inside = asyncio.Event(), []
+
+        async def handler(connection):
+            inside.append(connection.remote_address[0])
+            await end.wait()
+
+        attend = attendant(monkeypatch, handler)
+        guests = [Connection(f"192.0.2.{100 + i}") for i in range(20)]
+        tasks = [asyncio.create_task(attend(one)) for one in (*guests, Connection("127.0.0.1"))]
+        await asyncio.sleep(0)
+        end.set()
+        await asyncio.gather(*tasks)
+        await attend(Connection("192.0.2.200"))  # in the place of one who left
+        return inside, [one.closed for one in guests]
+
+    inside, closed = asyncio.run(crowd())
+    assert inside == [*(f"192.0.2.{100 + i}" for i in range(6)), "127.0.0.1", "192.0.2.200"]
+    assert closed == [None] * 6 + ["too many visitors"] * 14
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "nobody.invalid", "1.2.3"])
+def test_a_host_that_is_not_this_machines_is_refused(host):
+    said = rf"host={host} is no address of this machine: pass one, or 0\.0\.0\.0"
+    with pytest.raises(ValueError, match=said), guarded(host):
+        pass
 
 
 def test_no_page_is_opened_by_a_version_of_mujoco_that_nobody_has_tried(monkeypatch):

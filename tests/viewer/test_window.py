@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_mcp.envs import Dribble, Heading
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import Steering
-from torchrl_mcp.viewer.window import LENGTH, apply_mouse, as_text, play_in_window
+from torchrl_mcp.viewer.window import LENGTH, Keyboard, apply_mouse, as_text, play_in_window
 
 GATED = TensorDictModule(
     lambda goal: (torch.zeros(len(goal), 17), torch.tensor([[1.0, 0.5]])),
@@ -81,6 +81,14 @@ def test_keys_pause_go_on_turn_and_begin_anew(opened):
     assert times == [1, 1, 1, 2, 3, 4, 1]
     [(tail, tip)] = walker.env.arrows(0)
     assert math.degrees(math.atan2(*(tip - tail)[1::-1])) == pytest.approx(15)
+
+
+def test_the_slowest_speed_reacts_within_a_second():
+    keyboard = Keyboard(Steering(player()))
+    for _ in range(20):
+        keyboard.press(ord("-"))
+    keyboard.execute()
+    assert 1 / 30 / keyboard.speed < 1
 
 
 def test_what_the_mouse_drags_is_pushed_and_where_it_chose_the_ground_the_target_goes():

@@ -7,7 +7,7 @@ Studio: :func:`guarded` is the one place that does, and refuses versions in whic
 
 import logging
 import socket
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from ipaddress import IPv6Address, ip_address
@@ -23,6 +23,9 @@ VERIFIED = "3.17"
 
 HERE = "127.0.0.1"
 """Address for access from this machine alone."""
+
+MOST_VISITORS = 6
+"""Number of visitors at once, of Studio's eight spectators, so that this machine always finds a place."""
 
 CONTROL = ("/ui", "/drop")
 """Paths on which the server accepts input, and files to load."""
@@ -41,18 +44,20 @@ def guarded(host: str) -> Iterator[None]:
 
     Raises:
         RuntimeError: If this is another version of MuJoCo, in which Studio may call other functions.
+        ValueError: If ``host`` is no address of this machine.
     """
     if not mujoco.__version__.startswith(f"{VERIFIED}."):
         raise RuntimeError(
             f"who may see a page of MuJoCo {mujoco.__version__} is not known: install mujoco {VERIFIED}, or use "
             "--viewer window"
         )
+    address = _address(host)
     level = web_server.logger.level
     web_server.logger.setLevel(logging.WARNING)
     bind, serve, banner = web_server.bind_public_socket, web_server.serve, web_viewer._print_url_banner
-    web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    web_server.bind_public_socket = lambda _, port=0: bind(address, port)
     web_server.serve = partial(_serve, serve)
-    web_viewer._print_url_banner = lambda _, port: print(_greeting(host, port), flush=True)
+    web_viewer._print_url_banner = lambda _, port: print(_greeting(address, port), flush=True)
     try:
         yield
     finally:
@@ -78,12 +83,68 @@ def refusal(path: str, headers: Mapping[str, str], address: str) -> str | None:
     return None
 
 
-def _serve(serve: Callable[..., Awaitable[Any]], *handler: Any, process_request: Callable, **settings: Any) -> Any:
+def _serve(
+    serve: Callable[..., Awaitable[Any]],
+    handler: Callable[..., Awaitable[Any]],
+    *,
+    process_request: Callable,
+    **settings: Any,
+) -> Any:
+    visitors: set[Any] = set()
+
     def admit(connection: Any, request: Any) -> Any:
-        reason = refusal(request.path, request.headers, connection.remote_address[0])
+        reason = refusal(request.path, request.headers, _sender(connection))
         return connection.respond(403, f"{reason}\n") if reason else process_request(connection, request)
 
-    return serve(*handler, process_request=admit, **settings)
+    async def attend(connection: Any) -> None:
+        if _is_here(_sender(connection)):
+            await handler(connection)
+        elif len(visitors) >= MOST_VISITORS:
+            await connection.close(1013, "too many visitors")
+        else:
+            visitors.add(connection)
+            try:
+                await handler(_Visitor(connection))
+            finally:
+                visitors.remove(connection)
+
+    return serve(attend, process_request=admit, **settings)
+
+
+class _Visitor:
+    """A connection whose messages but signs of life are dropped, such as those that ask for control."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._connection, name)
+
+    async def __aiter__(self) -> AsyncIterator[str | bytes]:
+        async for message in self._connection:
+            if message in (web_server._STATE_ACK_MESSAGE, web_server._SessionMessage.HEARTBEAT):
+                yield message
+
+
+def _sender(connection: Any) -> str:
+    """Address of who opened a connection, which is :data:`HERE` for this machine by any of its addresses."""
+    sender: str = connection.remote_address[0]
+    return HERE if sender == connection.local_address[0] else sender
+
+
+def _address(host: str) -> str:
+    """The numerical address of a host.
+
+    Raises:
+        ValueError: If it is no address of this machine.
+    """
+    try:
+        family, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family) as test:
+            test.bind(address)
+    except OSError as error:
+        raise ValueError(f"host={host} is no address of this machine: pass one, or 0.0.0.0 for all") from error
+    return str(address[0])
 
 
 def _is_ours(name: str) -> bool:
@@ -101,6 +162,9 @@ def _is_here(address: str) -> bool:
 
 
 def _greeting(host: str, port: int) -> str:
-    if _is_here("127.0.0.1" if host == "localhost" else host):
+    if _is_here(host):
         return f"http://localhost:{port}/, for this machine alone. Ctrl+C ends it"
-    return f"http://{socket.gethostname() if host in ('0.0.0.0', '::') else host}:{port}/. {VISITORS}. Ctrl+C ends it"
+    name = f"[{host}]" if ":" in host else host
+    if host in ("0.0.0.0", "::"):
+        name = f"localhost:{port}/, elsewhere http://{socket.gethostname()}"
+    return f"http://{name}:{port}/. {VISITORS}. Ctrl+C ends it"

@@ -15,6 +15,9 @@ from torchrl_mcp.viewer.player import Player
 TURN = math.radians(15)
 """Angle by which a key turns the target direction, in radians."""
 
+SLOWEST = 0.05
+"""Least speed of a live viewer, as a share of real time: it reacts once in a control step."""
+
 SPEED_STEP = 0.25
 """Change of the target speed by a key, in m/s."""
 
@@ -181,7 +184,9 @@ class Steering:
             self.player.env.episode["seconds_left"][0] = 0.0  # the task draws another
         self.direction = self.speed = self.place = None
         self.player.pinned = {}
-        self.player.env.max_episode_steps = self._time_limit
+        if self.player.env.max_episode_steps != self._time_limit:  # the episode goes on with its full length
+            self.player.env.max_episode_steps = self._time_limit
+            self.player.env.episode["elapsed_steps"][0] = 0
         if isinstance(self.player.env, Heading):
             self.player.env.max_turn, self.player.env.change_probability = self._changes
 

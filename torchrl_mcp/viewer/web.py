@@ -14,7 +14,7 @@ from torchrl_mcp.viewer.mouse import Mouse
 from torchrl_mcp.viewer.panel import Command, draw
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.scenery import softly_lit
-from torchrl_mcp.viewer.steering import TURN, Steering
+from torchrl_mcp.viewer.steering import SLOWEST, TURN, Steering
 
 FURTHER = 1.4
 """Factor on the camera's distance in films: a notice of Studio covers the upper part of the page."""
@@ -160,7 +160,7 @@ def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
     with guarded(host), launch_web.launch(config, plugins=[app, pace, BrowserInput(steering)]) as viewer:
         while viewer.is_running():
-            due = time.perf_counter() + player.env.control_timestep / pace.speed
+            due = time.perf_counter() + player.env.control_timestep / max(pace.speed, SLOWEST)
             if not pace.paused:
                 steering.step()
             mujoco.mj_copyData(data, model, player.data)

@@ -14,7 +14,7 @@ from torchrl_mcp.envs.rendering.camera import add_shapes
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.scenery import softly_lit
-from torchrl_mcp.viewer.steering import TURN, Steering
+from torchrl_mcp.viewer.steering import SLOWEST, TURN, Steering
 
 LENGTH = 24
 """Number of strokes for a weight of 1."""
@@ -67,7 +67,7 @@ class Keyboard:
         self.paused = not self.paused
 
     def _pace(self, factor: float) -> None:
-        self.speed *= factor
+        self.speed = max(self.speed * factor, SLOWEST)
 
 
 def play_in_window(player: Player) -> None:

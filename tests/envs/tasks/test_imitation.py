@@ -48,6 +48,13 @@ def idle(env, state):
     return env.step(state.set("action", torch.zeros(env.action_spec.shape, dtype=torch.float64)))["next"]
 
 
+def test_a_reset_of_nobody_draws_no_motion():
+    env = make()
+    step = env.rand_step(env.reset())["next"]
+    after = env.reset(step.clone().set("_reset", torch.zeros(4, 1, dtype=torch.bool)))
+    assert torch.equal(after["observation"], step["observation"])
+
+
 @every_character
 def test_specs_describe_what_the_environment_does(character):
     check_env_specs(make(character), seed=0)
