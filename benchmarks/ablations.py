@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from archive import EMPTY, archived, average, score, write_tables
+from archive import EMPTY, archived, average, label, score, write_tables
 
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.runs.tables import text_table
@@ -32,15 +32,26 @@ def main() -> None:
 
 
 def variants(found: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return a row for each variant: its settings, the imitation that it begins with, and its score in each task."""
-    transfers = [cell for cell in found if cell.stage == "transfer"]
-    imitated = {chosen(cell, 2): completed(cell) for cell in found if cell.stage == "pretrain"}
-    scores = {(chosen(cell), cell.place[0]): score(cell) for cell in transfers}
-    tasks = dict.fromkeys(cell.place[0] for cell in transfers)
+    """Return a row for each variant: its settings, the imitation that it begins with, and its score in each task.
+
+    Columns name the character if there are several. Methods that lack one of the settings are left out.
+
+    Raises:
+        SystemExit: If two cells of a variant differ in other settings.
+    """
+    transfers = [cell for cell in found if cell.stage == "transfer" and None not in chosen(cell)]
+    imitated = {(chosen(cell, 2), cell.place[1]): completed(cell) for cell in found if cell.stage == "pretrain"}
+    scores: dict[Any, Cell] = {}
+    for cell in transfers:
+        if (other := scores.setdefault((chosen(cell), cell.place), cell)) is not cell:
+            raise SystemExit(f"{label(other)} and {label(cell)} are one row of the table: archive one of them alone")
+    places = dict.fromkeys(cell.place for cell in transfers)
+    characters = dict.fromkeys(character for _, character in places)
+    ends = {character: f", {character}" if len(characters) > 1 else "" for character in characters}
     return [
         dict(zip(VARIED, variant, strict=True))
-        | {"imitation, completed": imitated.get(variant[:2], EMPTY)}
-        | {task: scores.get((variant, task), EMPTY) for task in tasks}
+        | {f"imitation, completed{end}": imitated.get((variant[:2], name), EMPTY) for name, end in ends.items()}
+        | {f"{task}{ends[name]}": score(scores.get((variant, (task, name)))) for task, name in places}
         for variant in sorted({chosen(cell) for cell in transfers}, key=order)
     ]
 

@@ -7,6 +7,7 @@ learning curves. ``torchrl-mcp-report`` reads it unpacked.
 import argparse
 import csv
 import io
+import math
 import shlex
 import tarfile
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,7 @@ from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.paper import PLACES
 from torchrl_mcp.report.results import MODES, Run, find_runs
 from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, NORMALISED_RETURN, PROVENANCE
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, NORMALISED_RETURN, PROVENANCE, replacing
 
 ARCHIVE = "runs.tar.xz"
 CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
@@ -62,15 +63,22 @@ def archived(description: str, results: Path) -> Iterator[tuple[list[Cell], Path
 
 
 def pack(root: Path, archive: Path) -> None:
-    """Write the complete runs of a folder, without checkpoints and without names of folders of this machine."""
+    """Write the complete runs of a folder, without checkpoints and without names of folders of this machine.
+
+    Raises:
+        SystemExit: If there are none.
+    """
     runs = [run for run in find_runs([root])[0] if run.state == "complete"]
-    with tarfile.open(archive, "w:xz", preset=9) as packed:
+    if not runs:
+        raise SystemExit(f"{root} holds no complete run: give a folder of runs that are trained and evaluated")
+    with replacing(archive) as partial, tarfile.open(partial, "w:xz", preset=9) as packed:
         for run in runs:
-            contents = {name: (run.path / name).read_text() for name in (CONFIG, EVALUATION, PROVENANCE)}
+            files = (run.path / name for name in (CONFIG, EVALUATION, PROVENANCE))
+            contents = {file.name: file.read_text() for file in files if file.exists()}  # older runs have no origin
             contents[METRICS] = curve(run.path / METRICS)
             for name, content in contents.items():
                 data = content.replace(str(root.resolve()), "runs").replace(str(root.absolute()), "runs").encode()
-                entry = tarfile.TarInfo(f"{run.path.resolve().relative_to(root.resolve())}/{name}")
+                entry = tarfile.TarInfo(f"{run.path.relative_to(root)}/{name}")
                 entry.size = len(data)
                 packed.addfile(entry, io.BytesIO(data))
 
@@ -88,27 +96,28 @@ def curve(metrics: Path) -> str:
 def write_tables(found: Sequence[Cell], output: Path) -> None:
     """Write the table and the learning curves of each task, and the list of all runs.
 
-    In a task, runs with more steps than the shortest that is not scratch are in the table alone; all of scratch's are
+    In a task, runs with more steps than the shortest of their method are in the table alone; all of scratch's are
     among the curves. A picture ends at four times the steps of its shortest curve.
     """
     for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
         here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
         twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
         stem = output / "_".join([*place, stage] if twice else place)
-        goal = 0.8 * max(float(learning_curve(cell).mean[-1]) for cell in here)
+        goal = 0.8 * max((float(curve.mean[-1]) for cell in here if (curve := learning_curve(cell))), default=math.inf)
         stem.with_suffix(".md").write_text(text_table([line(cell, goal) for cell in here], markdown=True) + "\n")
         drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
-        curves = [learning_curve(cell) for cell in drawn]
-        figure = draw_curves(curves, ylabel="normalised return in training")
-        ends = [float(curve.frames[-1]) for curve in curves]
-        figure.axes[0].set_xlim(0, min(4 * min(ends), max(ends)))
-        save_figure(figure, stem)
+        if curves := [curve for cell in drawn if (curve := learning_curve(cell))]:
+            figure = draw_curves(curves, ylabel="normalised return in training")
+            ends = [float(curve.frames[-1]) for curve in curves]
+            figure.axes[0].set_xlim(0, min(4 * min(ends), max(ends)))
+            save_figure(figure, stem)
     write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
 
 
 def is_short(cell: Cell, others: Sequence[Cell]) -> bool:
-    """Return whether a cell has at most as many steps as any of the others whose method is not scratch."""
-    steps = [other.complete[0].total_frames for other in others if other.method != "scratch"]
+    """Return whether a cell has at most as many steps as any of its method, or scratch as any of the other methods."""
+    alike = [other for other in others if other.method != "scratch" and cell.method in ("scratch", other.method)]
+    steps = [other.complete[0].total_frames for other in alike]
     return cell.complete[0].total_frames <= min(steps, default=0)
 
 
@@ -155,15 +164,19 @@ def line(cell: Cell, goal: float) -> dict[str, Any]:
 
 def minutes_to(cell: Cell, goal: float) -> float | None:
     """Return the minutes of training until the learning curve, a mean over seeds, reaches a return; None if never."""
-    curve = learning_curve(cell)
+    if not (curve := learning_curve(cell)):
+        return None
     reached = [frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= goal]
     return float(reached[0]) / cell.complete[0].frames * cell.seconds / 60 if reached else None
 
 
-def learning_curve(cell: Cell) -> Curve:
-    """Return the learning curve of a cell, of the first run of each seed, in bins of its own steps."""
-    (curve,) = learning_curves({label(cell): [runs[0].path for runs in cell.by_seed.values()]})
-    return curve
+def learning_curve(cell: Cell) -> Curve | None:
+    """Return the learning curve of a cell, of the first run of each seed, in bins of its own steps.
+
+    Runs in which no episode of full length has ended are left out; without others, there is no curve.
+    """
+    paths = [runs[0].path for runs in cell.by_seed.values() if runs[0].has_episodes]
+    return learning_curves({label(cell): paths})[0] if paths else None
 
 
 def score(cell: Cell | None) -> str:

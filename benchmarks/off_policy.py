@@ -210,13 +210,13 @@ def earned(policy: TensorDictModuleBase, env: EnvBase, seconds: float) -> dict[s
 
 def draw(rows: list[dict[str, Any]]) -> Figure:
     """Draw the returns of all seeds against steps, and against seconds."""
-    figure = new_figure(8.0, 3.4)
+    figure, learners = new_figure(8.0, 3.4), dict.fromkeys(row["learner"] for row in rows)
     for axes, (key, label) in zip(
         figure.subplots(1, 2, sharey=True),
         [("steps", "environment steps"), ("cpu_seconds", "seconds of one core")],
         strict=True,
     ):
-        plot_curves(axes, [curve(rows, learner, key) for learner in LEARNERS], xlabel=label)
+        plot_curves(axes, [curve(rows, learner, key) for learner in learners], xlabel=label)
     axes.set(ylabel="")
     axes.legend(frameon=False)
     return figure

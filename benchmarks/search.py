@@ -6,9 +6,10 @@ r"""Search of settings at equal processor time: every trial trains for the same 
 
 Optuna's TPE sampler proposes settings, each of them an argument of ``torchrl-mcp-train``. A trial is stopped by its CPU
 seconds, counted from the first step on, so that other work on the machine does not falsify the comparison. Its score is
-the mean of two returns: the median in training over the last fifth of the time, and 64 deterministic episodes of the
-printed task. Trials with a training return below the median of the others at half the time are given up. Repeated, the
-command goes on with the trials that are missing. With candidates, it compares these alone, one run per seed.
+the mean of two returns: the mean of the episodes of training that ended in the last fifth of the time, and that of 64
+deterministic episodes of the printed task. Trials with a training return below the median of the others at half the
+time are given up. Repeated, the command goes on with the trials that are missing. With candidates, it compares these
+alone, one run per seed, in a table of their own.
 
 Optuna 4 or newer does not go with Hydra's plugin: install it in an environment of its own.
 """
@@ -16,7 +17,9 @@ Optuna 4 or newer does not go with Hydra's plugin: install it in an environment 
 import argparse
 import csv
 import json
+import math
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -77,12 +80,13 @@ def cpu_seconds(pid: int) -> float:
 
 
 def recent_return(folder: Path, share: float) -> float:
-    """Return the mean normalised return of the episodes that ended in the last ``share`` of the seconds.
+    """Return the mean normalised return of the episodes that ended in the last ``share`` of the seconds, 0 if none did.
 
     An iteration weighs as much as the episodes that end in it: else early falls would count most.
     """
     rows = read_metrics(folder)
-    late = [row for row in rows if row["seconds"] >= (1 - share) * rows[-1]["seconds"] and row["episode/count"] > 0]
+    late = [row for row in rows if row["seconds"] >= (1 - share) * rows[-1]["seconds"]]
+    late = [row for row in late if math.isfinite(row[NORMALISED_RETURN])]  # from the first episode of full length on
     count = sum(row["episode/count"] for row in late)
     return sum(row["episode/count"] * row[NORMALISED_RETURN] for row in late) / count if count else 0.0
 
@@ -126,7 +130,7 @@ def score(folder: Path, seconds: float, words: list[str], trial: optuna.Trial | 
     command = ["torchrl-mcp-evaluate", folder, "--episodes", "64", "--seed", "777", "--output", output]
     subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     evaluated = json.loads(output.read_text())["deterministic"]["normalised_return"]
-    last = read_metrics(folder)[-1]
+    last = (read_metrics(folder) or [{"frames": 0.0}])[-1]
     dead = [value for name, value in last.items() if name.startswith("dead")]
     return {
         "cpu_seconds": used,
@@ -183,16 +187,27 @@ def main() -> None:
 
 
 def compare(root: Path, fixed: list[str], candidates: dict[str, str], seeds: list[int], seconds: float) -> None:
-    """Train and evaluate candidates with every seed, and write a row for each."""
+    """Train and evaluate candidates with every seed, and write a row for each.
+
+    Raises:
+        SystemExit: If a candidate was scored with other seconds or settings.
+    """
     table = []
     for seed in seeds:
         for name, settings in candidates.items():
             folder = root / f"{name}-seed{seed}"
+            words = [*fixed, f"seed={seed}", "checkpoint_interval=4", *settings.split()]
+            asked = {"seconds": seconds, "settings": " ".join(words)}
             if not (found := folder / "score.json").exists():
-                numbers = score(folder, seconds, [*fixed, f"seed={seed}", "checkpoint_interval=4", *settings.split()])
-                found.write_text(json.dumps(numbers))
-            table.append({"candidate": name, "seed": seed, **json.loads(found.read_text()), "settings": settings})
-            write_rows(table, root.with_suffix(".csv"))
+                shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
+                found.write_text(json.dumps(score(folder, seconds, words) | asked))
+            held = json.loads(found.read_text())
+            if changed := [key for key, value in asked.items() if held.get(key) != value]:
+                raise SystemExit(
+                    f"{folder} was scored with other {' and '.join(changed)}: remove it, or give another --root"
+                )
+            table.append({"candidate": name, "seed": seed, **held})
+            write_rows(table, root.with_name(f"{root.name}-candidates.csv"))
 
 
 def write(study: optuna.Study, path: Path) -> None:

@@ -1,11 +1,14 @@
 """The benchmarks run; what they measure is no business of a test."""
 
 import csv
+import importlib
 import importlib.util
+import json
 import runpy
 import sys
 from itertools import product
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -156,6 +159,72 @@ def test_a_gate_is_trained_by_soft_actor_critic_and_by_ppo(tmp_path):
     assert [row["learner"] for row in rows] == ["SAC"] * 2 + ["PPO"] * 2
     assert all(0 < float(row["normalised_return"]) < 1 for row in rows)
     assert (tmp_path / "out.png").exists()
+
+
+def test_learners_are_drawn_that_have_rows(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    draw = runpy.run_path(str(BENCHMARKS / "off_policy.py"))["draw"]
+    rows = [{"learner": "SAC", "steps": steps, "cpu_seconds": 1.0, "normalised_return": 0.5} for steps in (64, 96)]
+    assert [[line.get_label() for line in axes.lines] for axes in draw(rows).axes] == [["SAC"]] * 2
+
+
+@pytest.fixture
+def search(monkeypatch):
+    """The search of settings, without Optuna, which comparisons of candidates do not need."""
+    for name in ("optuna", "optuna.storages", "optuna.storages.journal"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.delitem(sys.modules, "search", raising=False)
+    return importlib.import_module("search")
+
+
+def test_candidates_are_scored_once_from_an_empty_folder_and_have_a_table_of_their_own(search, tmp_path, monkeypatch):
+    scored = []
+
+    def score(folder, seconds, words):
+        assert not folder.exists()
+        folder.mkdir()
+        scored.append(folder.name)
+        return {"cpu_seconds": seconds + 0.5}
+
+    monkeypatch.setattr(search, "score", score)
+    (tmp_path / "heading-mcp/small-seed7").mkdir(parents=True)
+    (tmp_path / "heading-mcp/small-seed7/config.yaml").touch()  # of an interrupted run
+    (tmp_path / "heading-mcp.csv").write_text("trials")
+    for _ in range(2):
+        search.compare(tmp_path / "heading-mcp", ["task=heading"], {"small": "width=0.1"}, [7], 90.0)
+    assert scored == ["small-seed7"]
+    with (tmp_path / "heading-mcp-candidates.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["seconds"] == "90.0"
+    assert {"task=heading", "seed=7", "width=0.1"} < set(row["settings"].split())
+    assert (tmp_path / "heading-mcp.csv").read_text() == "trials"
+
+
+@pytest.mark.parametrize(
+    ("settings", "seconds", "named"),
+    [("width=0.1", 900.0, "seconds"), ("width=0.2", 90.0, "settings"), ("width=0.2", 900.0, "seconds and settings")],
+)
+def test_a_score_of_other_seconds_or_settings_is_not_taken(search, tmp_path, monkeypatch, settings, seconds, named):
+    monkeypatch.setattr(search, "score", lambda folder, *_: folder.mkdir(parents=True) or {"cpu_seconds": 90.5})
+    search.compare(tmp_path, [], {"small": "width=0.1"}, [7], 90.0)
+    with pytest.raises(
+        SystemExit, match=f"small-seed7 was scored with other {named}: remove it, or give another --root"
+    ):
+        search.compare(tmp_path, [], {"small": settings}, [7], seconds)
+
+
+def test_a_search_weighs_episodes_of_full_length_alone_and_goes_on_without_any(search, tmp_path, monkeypatch):
+    assert search.recent_return(tmp_path, 0.2) == 0.0
+    header = "frames,seconds,episode/count,episode/normalised_return\n"
+    (tmp_path / "metrics.csv").write_text(header + "10,1,5,0.9\n20,9,7,nan\n30,9.5,1,0.2\n40,10,3,0.6\n")
+    assert search.recent_return(tmp_path, 0.2) == pytest.approx((1 * 0.2 + 3 * 0.6) / 4)
+    (tmp_path / "metrics.csv").unlink()  # all time has passed before the first iteration
+    (tmp_path / "search.json").write_text(json.dumps({"deterministic": {"normalised_return": 0.1}}))
+    monkeypatch.setattr(search, "train", lambda *_: 90.0)
+    monkeypatch.setattr(search.subprocess, "run", lambda *_, **__: None)
+    found = search.score(tmp_path, 90.0, [])
+    assert (found["steps"], found["training"], found["deterministic"]) == (0.0, 0.0, 0.1)
 
 
 def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):

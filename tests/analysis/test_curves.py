@@ -4,12 +4,13 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib import _pylab_helpers
-from matplotlib.colors import same_color
+from matplotlib.colors import same_color, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, save_figure, write_curves
 from torchrl_mcp.analysis.curves import plot_curves
+from torchrl_mcp.analysis.figures import COLOURS
 
 RETURN = "episode/normalised_return"
 
@@ -125,6 +126,22 @@ def test_each_curve_is_one_line_of_its_own_colour_that_the_legend_names(tmp_path
     assert not any(same_color(a.get_color(), b.get_color()) for a in lines[:7] for b in lines[:7] if a is not b)
     for line in lines:
         np.testing.assert_allclose(line.get_ydata(), 0.5)
+
+
+def test_a_curve_of_a_single_point_is_seen(tmp_path):
+    runs = [constant_run(tmp_path / f"{number} rows", 0.5, num_rows=number) for number in (1, 10)]
+    single, line = learning_curves({run.name: [run] for run in runs}, num_bins=10)
+    assert (len(single.frames), len(line.frames)) == (1, 10)
+    picture, _ = save_figure(draw_curves([single]), tmp_path / "dot")
+    below_the_legend = imread(picture)[60:, :, :3]
+    assert np.isclose(below_the_legend, to_rgb(COLOURS[0]), atol=0.01).all(-1).sum() > 100
+    assert [line.get_marker() for line in draw_curves([line]).axes[0].lines] == ["None"]
+
+
+def test_the_legend_names_curves_that_begin_with_an_underscore(tmp_path):
+    run = constant_run(tmp_path / "run", 0.5)
+    figure = draw_curves(learning_curves({name: [run] for name in ("_baseline", "tuned")}))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["_baseline", "tuned"]
 
 
 @pytest.mark.parametrize("length", [1, 26, 28, 60])

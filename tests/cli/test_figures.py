@@ -3,6 +3,7 @@
 import csv
 import shutil
 import sys
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 
 from torchrl_mcp.cli import figures
+from torchrl_mcp.commands import figures as drawing
 from torchrl_mcp.envs.motions.single import single_motion
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
@@ -34,6 +36,7 @@ def save(folder, *overrides):
     agent = build.make_agent(cfg, build.make_env(cfg, num_envs=1, seed=0))
     config = OmegaConf.to_container(cfg, resolve=True)
     publish(agent.parts, config, folder / "checkpoints" / "checkpoint-000000000128.torchrl")
+    OmegaConf.save(config, folder / "config.yaml")
     with (folder / "metrics.csv").open("w", newline="") as file:
         csv.writer(file).writerows(
             [["frames", "episode/count", "episode/normalised_return"], [64, 2, 0.1], [128, 2, 0.3]]
@@ -163,6 +166,41 @@ def test_holdout_draws_trajectories_by_direction_and_curves(runs, tmp_path, monk
     unfinished = {row["panel"] for row in rows(tmp_path / "holdout_option_critic.csv")}
     assert unfinished == {"in pre-training, on directions it saw", "in pre-training, on held-out directions"}
     assert {row["label"] for row in rows(tmp_path / "holdout_curves.csv")} == {"MCP"}  # what was transferred
+
+
+def test_holdout_averages_runs_of_the_same_settings_alone(runs, tmp_path, monkeypatch):
+    copies = [shutil.copytree(runs["ant transfer"], tmp_path / f"{i}") for i in range(3)]
+    for copy, num_primitives, value in zip(copies, (2, 8, 8), (0.1, 0.5, 0.7), strict=True):
+        settings = OmegaConf.load(copy / "config.yaml")
+        settings.num_primitives = num_primitives
+        OmegaConf.save(settings, copy / "config.yaml")
+        metrics = (copy / "metrics.csv").read_text()
+        (copy / "metrics.csv").write_text(metrics.replace(",0.1", f",{value}").replace(",0.3", f",{value}"))
+    call(monkeypatch, "holdout", *copies, "--output", tmp_path)
+    found = {
+        (row["label"], row["seeds"], round(float(row["mean"]), 6)) for row in rows(tmp_path / "holdout_curves.csv")
+    }
+    assert found == {("MCP, 2 primitives", "1", 0.1), ("MCP", "2", 0.6)}
+
+
+def test_a_character_of_your_own_has_its_name_in_titles(tmp_path, monkeypatch):
+    class Drawn(Exception):
+        pass
+
+    def draw(*_, title):
+        raise Drawn(title)
+
+    cfg = OmegaConf.create({"method": {"title": "Mine"}, "character": {"name": "spider"}})
+    monkeypatch.setattr(drawing, "_explored", lambda arguments: ({}, "spider"))
+    monkeypatch.setattr(drawing.exploration, "draw_exploration", draw)
+    monkeypatch.setattr(drawing.policies, "policy_config", lambda path: cfg)
+    monkeypatch.setattr(drawing.checkpoints, "walk_of", lambda *_, **__: (None, {}))
+    monkeypatch.setattr(drawing, "draw_walk_cycle", draw)
+    shared = {"checkpoints": [tmp_path], "output": tmp_path, "seconds": 1.0, "seed": 0}
+    with pytest.raises(Drawn, match="spider, 2 times"):
+        drawing.explore(Namespace(trajectories=2, **shared))
+    with pytest.raises(Drawn, match="Mine, spider, walking"):
+        drawing.analyse(Namespace(clip=None, walkers=1, **shared))
 
 
 @pytest.mark.parametrize(

@@ -167,14 +167,21 @@ def test_no_file_is_overwritten(run, taken, tmp_path):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_the_card_compares_no_range_of_speeds_with_the_paper(tmp_path):
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ([], "the paper: 0.970 ± 0.003"),
+        (["+task.transfer.speed=[0.0,1.0]"], "the paper: no return"),
+        (["num_primitives=4"], "the paper: no return"),
+    ],
+    ids=str,
+)
+def test_the_card_compares_neither_a_range_of_speeds_nor_a_variant_with_the_paper(tmp_path, settings, said):
     values = {"normalised_return": 0.5, "interval": (0.4, 0.6), "terminated": 0.0, "metrics": {}}
     numbers = {"episodes": 2, "seed": 0, "deterministic": values, "stochastic": values}
     (tmp_path / "gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
-    for range_of_speeds, said in (([], "the paper: 0.970 ± 0.003"), (["+task.transfer.speed=[0.0,1.0]"], "no return")):
-        cfg = compose_run("task=heading", "character=humanoid", "stage=transfer", *range_of_speeds)
-        card = publishing.model_card(tmp_path / "gate.torchrl", cfg, numbers, origin={}, steps=1, limits=[])
-        assert said in card
+    cfg = compose_run("task=heading", "character=humanoid", "stage=transfer", f"run_dir={tmp_path}", *settings)
+    assert said in publishing.model_card(tmp_path / "gate.torchrl", cfg, numbers, origin={}, steps=1, limits=[])
 
 
 def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):

@@ -8,8 +8,11 @@ from torchrl_mcp.report.paper import TABLE_2
 CONFIG = """
 task: {name: heading}
 character: {name: biped}
-method: {name: mcp}
+method: {name: mcp, title: MCP, standard: {num_primitives: 8}}
 stage: {name: transfer}
+seed: 0
+training: {total_frames: 1000}
+num_primitives: 8
 """
 
 
@@ -45,9 +48,10 @@ def test_the_next_commands_of_a_run_with_own_code_trust_it(folder):
     assert "--trust" not in report
 
 
-def test_pretraining_has_no_figure_of_the_papers(folder):
+@pytest.mark.parametrize("change", [("transfer", "pretrain"), ("\nnum_primitives: 8", "\nnum_primitives: 4")], ids=str)
+def test_pretraining_and_variants_have_no_figure_of_the_papers(folder, change):
     evaluate(folder)
-    (folder / "config.yaml").write_text(CONFIG.replace("transfer", "pretrain"))
+    (folder / "config.yaml").write_text(CONFIG.replace(*change))
     assert "paper" not in summary(folder)
 
 

@@ -1,10 +1,15 @@
 """Sweeps: one bad run does not end them, and repeating them finishes them."""
 
+import os
 import subprocess
 import sys
+from datetime import datetime
 from importlib.util import find_spec
 
 import pytest
+from omegaconf import OmegaConf
+
+from torchrl_mcp.commands.sweep import Sweep
 
 SMOKE = ["preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "evaluation.episodes=0", "width=0.05"]
 # The ant has no heading, and the first step size diverges.
@@ -14,6 +19,23 @@ SWEEP = ["--multirun", *RUNS, "optimizer.actor.lr=1e30,1e-4"]
 
 def failures(outcome):
     return [line for line in outcome.stderr.splitlines() if line.startswith("failed: ") and ".log" in line]
+
+
+def test_sweeps_of_two_processes_have_logs_of_their_own(tmp_path, monkeypatch):
+    folders = set()
+    for process in (1, 2):
+        monkeypatch.setattr(os, "getpid", lambda process=process: process)
+        monkeypatch.setattr("torchrl_mcp.commands.sweep.datetime", SameSecond)
+        sweep = Sweep()
+        sweep.on_multirun_start(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+        folders.add(sweep.folder)
+    assert len(folders) == 2
+
+
+class SameSecond(datetime):
+    @classmethod
+    def now(cls):
+        return cls(2026, 1, 2)
 
 
 def test_every_other_run_of_a_sweep_takes_place_and_repeated_it_skips_what_is_complete(command, tmp_path):

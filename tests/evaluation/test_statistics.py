@@ -1,9 +1,11 @@
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
+from torchrl_mcp.evaluation import statistics
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, probability_of_improvement
 
 
@@ -52,6 +54,16 @@ def test_the_interquartile_mean_leaves_out_the_outer_quarters_of_all_tasks_toget
 def test_tasks_that_differ_widen_no_interval_because_seeds_are_resampled_within_them():
     estimate = interquartile_mean([[0.1, 0.1], [0.9, 0.9], [0.2, 0.2], [0.6, 0.6]])
     assert (estimate.low, estimate.high) == (estimate.value, estimate.value) == pytest.approx((0.4, 0.4))
+
+
+def test_differing_numbers_of_seeds_take_little_memory(monkeypatch):
+    monkeypatch.setattr(statistics, "BATCH", 100_000)
+    strata = [np.random.default_rng(size).normal(size=size) for size in (4, 5, 7, 9)]
+    tracemalloc.start()
+    interquartile_mean(strata)  # each value of a resample stands for up to 315 equal ones
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10 * 8 * statistics.BATCH
 
 
 def test_a_task_of_a_single_seed_leaves_nothing_to_resample():

@@ -171,6 +171,57 @@ def test_the_name_of_the_folder_of_runs_may_occur_in_their_files(tmp_path, run_w
     assert "run_dir: runs/run\n" in (kept / "run/config.yaml").read_text()
 
 
+def test_an_archive_stays_until_complete_runs_replace_it(tmp_path, run_writers, monkeypatch):
+    write, _ = run_writers(tmp_path)
+    write("done/run", score=0.5, preset=None)  # an older run, without origin.json
+    write("begun/run", progress=0.5)
+    tabulate(monkeypatch, tmp_path / "done", "--output", tmp_path)
+    kept = (tmp_path / "runs.tar.xz").read_bytes()
+    with pytest.raises(SystemExit, match="begun holds no complete run: give a folder of runs that are trained"):
+        tabulate(monkeypatch, tmp_path / "begun", "--output", tmp_path)
+    write("other/run", score=0.5)
+    monkeypatch.setattr(tarfile.TarFile, "addfile", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        tabulate(monkeypatch, tmp_path / "other", "--output", tmp_path)
+    assert (tmp_path / "runs.tar.xz").read_bytes() == kept
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_a_run_behind_a_link_is_archived_where_the_link_is(tmp_path, run_writers, monkeypatch):
+    run_writers(tmp_path)[0]("elsewhere/run", score=0.5)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs/linked").symlink_to(tmp_path / "elsewhere")
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path)
+    assert (unpack(tmp_path / "runs.tar.xz", tmp_path / "kept") / "linked/run/config.yaml").exists()
+
+
+def test_a_run_without_an_episode_of_full_length_is_in_the_tables_and_has_no_curve(tmp_path, run_writers, monkeypatch):
+    write, write_mcp = run_writers(tmp_path / "runs")
+    for folder in (write("heading", score=0.5), write("carry", task="carry", score=0.25)):
+        metrics = folder / "metrics.csv"
+        metrics.write_text(metrics.read_text().replace(",1,0.5", ",1,nan"))
+    write_mcp("mcp", score=0.75)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path)
+    head, *rows = cells_of((tmp_path / "heading_biped.md").read_text())
+    found = {row[0]: dict(zip(head, row, strict=True)) for row in rows}
+    assert (found["Scratch"]["deterministic"], found["Scratch"]["to 0.8"]) == ("0.500", "")
+    drawn = (tmp_path / "heading_biped.svg").read_text()
+    assert [f"<!-- {name} -->" in drawn for name in ("Scratch", "MCP")] == [False, True]
+    assert "0.250" in (tmp_path / "carry_biped.md").read_text()
+    assert not (tmp_path / "carry_biped.svg").exists()
+
+
+def test_a_short_run_of_one_method_leaves_the_curves_of_the_others(tmp_path, run_writers, monkeypatch):
+    write, write_mcp = run_writers(tmp_path / "runs")
+    write("trial", method="finetune", score=0.2)
+    write_mcp("mcp", score=0.9, total_frames=4000)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path)
+    assert "<!-- MCP -->" in (tmp_path / "heading_biped.svg").read_text()
+
+
 def test_without_runs_and_archive_the_script_says_what_it_needs(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         tabulate(monkeypatch, "--output", tmp_path)
@@ -208,6 +259,30 @@ def test_the_table_of_ablations_has_a_row_for_each_variant(tmp_path, run_writers
         "MCP, num_primitives=4, exploration=weights",
         "MCP, trained=gate and primitives, exploration=action",
     ]
+
+
+def test_ablations_of_several_characters_have_a_column_each_and_other_methods_none(tmp_path, run_writers, monkeypatch):
+    write, write_mcp = run_writers(tmp_path / "runs")
+    for character, score in (("biped", 0.5), ("humanoid", 0.25)):
+        write_mcp(character, task="dribble", character=character, score=score)
+    add_tracking_error(write_mcp("source", stage="pretrain", task="imitation", character="humanoid", score=0.5))
+    write("scratch", task="dribble", score=0.125)
+    tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path, script="ablations")
+    head, row = cells_of((tmp_path / "table.md").read_text())
+    assert dict(zip(head[4:], row[4:], strict=True)) == {
+        "imitation, completed, biped": "",
+        "imitation, completed, humanoid": "75%",
+        "dribble, biped": "0.500 (1)",
+        "dribble, humanoid": "0.250 (1)",
+    }
+
+
+def test_runs_of_one_variant_that_differ_in_their_length_have_no_common_row(tmp_path, run_writers, monkeypatch):
+    _, write_mcp = run_writers(tmp_path / "runs")
+    for steps in (1_000_000, 3_000_000):
+        write_mcp(f"{steps}", score=0.5, total_frames=steps)
+    with pytest.raises(SystemExit, match=r"MCP, 1\.0 M steps and MCP, 3\.0 M steps are one row"):
+        tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path, script="ablations")
 
 
 def test_pretrainings_of_other_lengths_are_told_apart(tmp_path, run_writers, monkeypatch):

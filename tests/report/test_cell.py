@@ -70,6 +70,18 @@ def test_an_evaluation_in_other_episodes_than_configured_is_remarked(write_run):
     assert cell.remarks == ["seeds 0, 1 evaluated in 32 episodes of seed 12345, which training would not do"]
 
 
+def test_an_evaluation_in_another_task_than_configured_is_remarked(write_run):
+    planned = {"success_reward": False, "speed": 1.0, "curriculum": None, "place": {"low": 0.0, "high": 1.0}}
+    held = {"success_reward": True, "speed": 1.0, "place": {"low": 0.0, "high": 2.0}, "added_later": 1}
+    settings = {"score": 0.5, "evaluation__environment": planned}
+    runs = [write_run(f"{seed}", seed=seed, environment=held, **settings) for seed in range(2)]
+    (cell,) = grouped(*runs)
+    assert cell.remarks == [
+        "seeds 0, 1 evaluated in 128 episodes of seed 12345 with success_reward=True with place.high=2.0, "
+        "which training would not do"
+    ]
+
+
 def test_evaluations_in_different_tasks_are_remarked(write_run):
     environments = [{"speed": 1.0, "success_reward": rewarded} for rewarded in (False, True)]
     (cell,) = grouped(*(write_run(str(i), seed=i, score=0.5, environment=use) for i, use in enumerate(environments)))

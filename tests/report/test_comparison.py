@@ -1,12 +1,13 @@
 """Which runs share a cell, and what is compared between cells."""
 
 import math
+from itertools import count
 
 import pytest
 
 from torchrl_mcp.report.comparison import ablations, caveats, cells, methods
 from torchrl_mcp.report.results import read_run
-from torchrl_mcp.report.sections import method_colours, row
+from torchrl_mcp.report.sections import method_colours, row, task_sections
 
 GATE_KEPT = ["primitives", "gating", "observation_normaliser"]
 
@@ -137,6 +138,14 @@ def test_a_method_of_your_own_is_known_by_the_title_and_the_settings_that_it_tel
         variant, standard = standard, variant
     assert (standard.title, standard.is_standard, variant.is_standard) == ("My Own", True, False)
     assert (row(standard).label, row(variant).label) == ("My Own", "My Own, top=2")
+
+
+def test_cells_with_the_same_label_have_a_curve_each(write_run):
+    mine = {"method": "mine", "method__title": "Mine", "depth": 2}
+    found = grouped(write_run("old", method__standard__depth=2, **mine), write_run("new", **mine), write_run("scratch"))
+    assert [row(cell).label for cell in found] == ["Scratch", "Mine", "Mine"]
+    (section,) = task_sections(found, map(str, count()), method_colours(found))
+    assert "of Scratch; Mine; Mine" in section.plot.svg
 
 
 def test_methods_have_colours_of_their_own_those_of_table_2_first(write_run):

@@ -24,6 +24,14 @@ def test_damaged_folders_alone_make_a_report(write_run, parse_page):
     assert "1 damaged" in parse_page(report(*find_runs([folder]), moment=datetime.now(UTC))["report.html"]).text
 
 
+def test_a_run_whose_metrics_end_in_a_short_line_is_damaged_and_the_report_is_made(write_run, tmp_path):
+    write_run("whole", score=0.5)
+    with (write_run("short", seed=1, score=0.5) / "metrics.csv").open("a") as file:
+        file.write("11,1000\n")
+    pages = report(*find_runs([tmp_path]), moment=datetime.now(UTC))
+    assert "1 damaged" in pages["report.md"]
+
+
 JUNK = [None, True, -1, 1e400, math.nan, "", "many", "<b>", [], [[]], {}, {"a": {}}, "9" * 400]
 
 

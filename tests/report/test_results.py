@@ -1,9 +1,11 @@
+import json
 import math
 import re
 import shutil
 
 import pytest
 
+from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.results import Damaged, Run, find_runs, read_run
 
 
@@ -12,6 +14,30 @@ def test_runs_are_found_at_any_depth_and_each_once(write_run, tmp_path):
     runs, damaged = find_runs([tmp_path / "runs", tmp_path / "runs" / "b", folders[0]])
     assert [run.path for run in runs] == folders
     assert not damaged
+
+
+def test_runs_below_other_runs_and_behind_links_are_found(write_run, tmp_path):
+    folders = [write_run("runs/exp"), write_run("runs/exp/longer"), write_run("elsewhere/run")]
+    (tmp_path / "runs/runs/linked").symlink_to(folders[-1])
+    (tmp_path / "runs/runs/exp/circle").symlink_to(tmp_path / "runs")
+    shutil.copytree(folders[1], folders[0] / "checkpoints/run")  # what is in there is the run's own
+    runs, _ = find_runs([tmp_path / "runs/runs"])
+    assert sorted(run.path.resolve() for run in runs) == sorted(folders)
+
+
+def test_a_config_yaml_alone_is_no_run_and_hides_none(write_run, tmp_path):
+    run = write_run("run")
+    (tmp_path / "config.yaml").write_text("x: 1\n")
+    runs, damaged = find_runs([tmp_path])
+    assert ([found.path for found in runs], damaged) == ([run], [])
+    (run / "metrics.csv").unlink()  # before the first iteration
+    assert [found.path for found in find_runs([tmp_path])[0]] == [run]
+
+
+def test_one_of_several_paths_may_hold_no_run(write_run, tmp_path):
+    run = write_run("run")
+    (tmp_path / "multirun").mkdir()
+    assert [found.path for found in find_runs([tmp_path / "multirun", run])[0]] == [run]
 
 
 def test_a_run_knows_what_its_files_say(write_run):
@@ -76,6 +102,7 @@ def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
             "iteration,frames,seconds\n1,1e300,1\n",
             "metrics.csv cannot be read: its frames are not numbers",
         ),
+        ("metrics.csv", "iteration,frames,seconds\n1,9,1\n2,10\n", "metrics.csv cannot be read: its last row has no"),
         ("origin.json", '{"commit": [1]}', "origin.json cannot be read: its commit is"),
         ("origin.json", "", "origin.json cannot be read: Expecting value"),
         ("origin.json", '{"choices": []}', "origin.json cannot be read"),
@@ -89,6 +116,13 @@ def test_a_damaged_file_is_named_with_the_reason(write_run, file, content, reaso
     assert run.state == "damaged"
     assert run.settings["method.name"] == "scratch"
     assert re.match(reason, run.fault), run.fault
+
+
+def test_an_evaluation_may_lack_its_environment(write_run):
+    folder = write_run("run", score=0.5)
+    content = json.loads((folder / "evaluation.json").read_text()) | {"environment": None}
+    (folder / "evaluation.json").write_text(json.dumps(content))
+    assert cells([read_run(folder)])[0].remarks == ["one seed: the interval is over its episodes"]
 
 
 def test_a_return_that_is_no_number_is_a_damage(write_run):

@@ -178,6 +178,36 @@ def test_means_are_over_the_rows_of_all_methods_each_with_the_cell_that_stands_f
     )
 
 
+def test_a_short_run_of_one_method_leaves_the_others_their_runs(run_writers, tmp_path):
+    write_run, write_mcp = run_writers(tmp_path)
+    write_run("trial", method="finetune", score=0.1)
+    for name, steps, score in (("long", 8000, 0.9), ("usual", 4000, 0.6)):
+        write_mcp(name, total_frames=steps, score=score)
+    (panel,) = drawn(tmp_path).axes
+    ours = {name: both["ours"] for name, both in bars(panel).items() if "ours" in both}
+    assert ours == pytest.approx({"Finetune": 0.1, "MCP": 0.6})
+
+
+def test_methods_without_a_common_row_have_a_panel_less(run_writers, tmp_path):
+    write_run, write_mcp = run_writers(tmp_path)
+    for task, method in (("heading", "scratch"), ("carry", "finetune")):
+        write_run(method, task=task, method=method, score=0.1)
+        write_mcp(task, task=task, score=0.5)
+    (panel,) = draw_over_rows(cells(find_runs([tmp_path])[0])).axes
+    assert panel.get_xlabel() == "probability that MCP is ahead"
+
+
+@pytest.mark.parametrize(("scores", "shown"), [((-0.2, 1.1), (-0.2, 1.1)), ((0.4, 0.6), (0.0, 1.0))], ids=str)
+def test_interquartile_means_lie_within_their_panel(run_writers, tmp_path, scores, shown):
+    write_run, write_mcp = run_writers(tmp_path)
+    write_mcp("mcp", score=scores[0])
+    write_run("scratch", score=scores[1])
+    left, _ = draw_over_rows(cells(find_runs([tmp_path])[0])).axes
+    low, high = left.get_xlim()
+    assert low <= shown[0] <= shown[1] <= high
+    assert (low, high) == pytest.approx(shown, abs=0.03)
+
+
 def test_without_another_method_nothing_is_compared(run_writers, tmp_path):
     run_writers(tmp_path)[1]("mcp", score=0.5)
     assert draw_over_rows(cells(find_runs([tmp_path])[0])) is None

@@ -201,6 +201,13 @@ def test_arguments_that_fit_no_row_are_refused_with_the_rows(tmp_path):
     assert "task=carry character=ant" in str(error.value)
 
 
+def test_a_value_that_is_in_no_row_is_refused_with_those_that_are(tmp_path):
+    with pytest.raises(ValueError, match="no row of the benchmark has method=scrach: give some of scratch,mcp"):
+        jobs_of("benchmark=smoke", f"run_root={tmp_path}", "method=mcp,scrach")
+    rows = [{"method": ["mcp"], "curriculum": ["none"]}, {"method": ["moe"]}]
+    benchmark.require_in_rows(rows, {"curriculum": ["mixed"], "seed": ["0"]})  # moe's row leaves them open
+
+
 def test_settings_that_folders_do_not_tell_apart_are_not_varied(tmp_path):
     with pytest.raises(ValueError, match="autocast, would share the folder"):
         jobs_of("benchmark=smoke", f"run_root={tmp_path}", "method=scratch", "autocast=true,false")

@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,12 @@ def learning_curves(
     return [_curve(label, [_binned(*points, edges) for points in group], edges) for label, group in runs.items()]
 
 
+def labelled_curves(groups: Sequence[tuple[str, Sequence[Path]]]) -> list[Curve]:
+    """Return :func:`learning_curves` of groups with their labels, which may be equal."""
+    curves = learning_curves({str(number): folders for number, (_, folders) in enumerate(groups)})
+    return [replace(curve, label=label) for curve, (label, _) in zip(curves, groups, strict=True)]
+
+
 def write_curves(curves: Sequence[Curve], path: Path) -> None:
     """Write curves as CSV: one row per label and bin, with ``frames``, ``mean``, ``low``, ``high`` and ``seeds``."""
     with path.open("w", newline="") as file:
@@ -85,7 +91,8 @@ def draw_curves(
         figure = new_figure(6.4, 3.2 + 0.2 * math.ceil(len(curves) / columns))
         plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
         style = {"frameon": False, "fontsize": 9, "labelcolor": INK}
-        legend = figure.legend(loc="outside upper center", ncols=columns, **style)
+        labels = [_legend(curve) for curve in curves]
+        legend = figure.legend(figure.axes[0].lines, labels, loc="outside upper center", ncols=columns, **style)
         figure.draw_without_rendering()
         if legend.get_window_extent().width <= figure.bbox.width:
             break
@@ -100,7 +107,7 @@ def plot_curves(
     xlabel: str = "environment steps",
     ylabel: str = "normalised return",
 ) -> None:
-    """Plot curves as lines, each with the range of its seeds as a band around it.
+    """Plot curves as lines, each with the range of its seeds as a band around it; a single point is a dot.
 
     Args:
         axes: Axes to draw on.
@@ -114,7 +121,8 @@ def plot_curves(
     styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
         axes.fill_between(curve.frames, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0)
-        axes.plot(curve.frames, curve.mean, label=_legend(curve), solid_capstyle="round", **style)
+        marker = "o" if len(curve.frames) == 1 else None
+        axes.plot(curve.frames, curve.mean, label=_legend(curve), marker=marker, solid_capstyle="round", **style)
     axes.set(xlabel=xlabel, ylabel=ylabel, xlim=(0, None))
     lowest = min(curve.low.min(initial=0.0) for curve in curves)
     bottom, top = axes.get_ylim()

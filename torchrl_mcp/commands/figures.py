@@ -12,13 +12,17 @@ from omegaconf import DictConfig
 from torch import nn
 
 from torchrl_mcp.analysis import checkpoints, exploration
-from torchrl_mcp.analysis.curves import draw_curves, learning_curves, write_curves
+from torchrl_mcp.analysis.curves import draw_curves, labelled_curves, learning_curves, write_curves
 from torchrl_mcp.analysis.exploration import Exploration
 from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.analysis.holdout import Trajectories, draw_trajectories
 from torchrl_mcp.analysis.walk_cycle import draw_walk_cycle
 from torchrl_mcp.analysis.walks import action_rows, cycle_rows, primitive_rows, specialisation
+from torchrl_mcp.report import sections
+from torchrl_mcp.report.cell import Cell
+from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.paper import CHARACTERS
+from torchrl_mcp.report.results import Run, read_run
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.tables import text_table
 
@@ -43,8 +47,8 @@ def holdout(arguments: argparse.Namespace) -> None:
         stem = arguments.output / f"holdout_{label.lower().replace(' ', '_').replace('-', '_')}"
         _save(draw_trajectories({f"{label} {name}": panel for name, panel in panels.items()}), stem)
         _write([row for name, panel in panels.items() for row in _ray_rows(name, panel)], stem)
-    if transfers := {label: stages["transfer"] for label, stages in runs.items() if "transfer" in stages}:
-        curves = learning_curves(transfers)
+    if transfers := _cells([path for stages in runs.values() for path in stages.get("transfer", [])]):
+        curves = labelled_curves([(sections.row(cell).label, [run.path for run in cell.runs]) for cell in transfers])
         _save(draw_curves(curves), arguments.output / "holdout_curves")
         write_curves(curves, arguments.output / "holdout_curves.csv")
 
@@ -60,7 +64,8 @@ def explore(arguments: argparse.Namespace) -> None:
     """Draw Figure 6: paths of random exploration, by method."""
     panels, character = _explored(arguments)
     stem = arguments.output / f"exploration_{character}"
-    title = f"{CHARACTERS[character]}, {arguments.trajectories} times from the same state, seen from above"
+    title = CHARACTERS.get(character, character)
+    title += f", {arguments.trajectories} times from the same state, seen from above"
     _save(exploration.draw_exploration(panels, title=title), stem)
     _write([{"panel": name, **row} for name, panel in panels.items() for row in exploration.path_rows(panel)], stem)
     numbers = [{"panel": name, **exploration.path_statistics(panel)} for name, panel in panels.items()]
@@ -98,7 +103,7 @@ def analyse(arguments: argparse.Namespace) -> None:
             path, clip=arguments.clip, walkers=arguments.walkers, seconds=arguments.seconds, seed=arguments.seed
         )
         stem = arguments.output / f"primitives_{name}"
-        title = f"{cfg.method.title}, {CHARACTERS[cfg.character.name]}"
+        title = f"{cfg.method.title}, {CHARACTERS.get(cfg.character.name, cfg.character.name)}"
         title += f", walking {arguments.clip or 'straight ahead'}"
         _save(draw_walk_cycle(walk, untrained, title=title), stem)
         _write(cycle_rows(walk), stem, "weights")
@@ -126,6 +131,16 @@ def _ray_rows(name: str, panel: Trajectories) -> list[dict[str, object]]:
         for step, (x, y) in enumerate(path, start=1)
         if step % 4 == 0 and math.isfinite(x)
     ]
+
+
+def _cells(folders: Sequence[Path]) -> list[Cell]:
+    """Cells of run folders, as in the report."""
+    runs = []
+    for folder in folders:
+        if not isinstance(run := read_run(folder), Run):
+            raise ValueError(f"{folder}: {run.reason}; give run folders, which have learning curves")
+        runs.append(run)
+    return cells(runs)
 
 
 def _label(cfg: DictConfig) -> str:

@@ -7,7 +7,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.report.paper import CHARACTERS, TABLE_2
+from torchrl_mcp.report.comparison import reported
+from torchrl_mcp.report.paper import CHARACTERS
+from torchrl_mcp.report.results import Run, leaves
 from torchrl_mcp.runs import policies, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.identity import CONDUCT, is_among
@@ -74,7 +76,7 @@ def model_card(
 
 {_facts(path, cfg, origin, steps)}
 
-Normalised return, {numbers["episodes"]} episodes of seed {numbers["seed"]} (the paper: {_paper(cfg)}):
+Normalised return, {numbers["episodes"]} episodes of seed {numbers["seed"]} (the paper: {_paper(path, cfg, origin)}):
 
 {returns}
 
@@ -117,9 +119,10 @@ def _returns(numbers: Mapping[str, Any]) -> str:
     return f"{value:.3f} ({low:.3f} to {high:.3f}), fallen {numbers['terminated']:.0%}{metrics}"
 
 
-def _paper(cfg: DictConfig) -> str:
+def _paper(path: Path, cfg: DictConfig, origin: Mapping[str, Any]) -> str:
     """Return the paper's number in Table 2, if it has one. Its heading has a single speed."""
-    reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
-    if cfg.stage.name != "transfer" or reported is None or OmegaConf.is_list(cfg.task.evaluation.get("speed")):
+    settings = dict(leaves(OmegaConf.to_container(cfg, resolve=True)))
+    paper = reported(Run(path, settings, provenance=origin))
+    if paper is None or OmegaConf.is_list(cfg.task.evaluation.get("speed")):
         return "no return"
-    return f"{reported.mean:.3f} ± {reported.std:.3f}"
+    return f"{paper.mean:.3f} ± {paper.std:.3f}"

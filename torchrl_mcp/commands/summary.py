@@ -5,9 +5,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
-from torchrl_mcp.report.paper import TABLE_2
+from torchrl_mcp.report.comparison import reported
+from torchrl_mcp.report.results import Run, read_run
 from torchrl_mcp.runs import quoting
 from torchrl_mcp.runs.trust import trust_options
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics
@@ -55,16 +54,15 @@ def _returns(folder: Path) -> list[str]:
         values.insert(
             1, f"{round(100 * reach['place'])}% of the way from standing still ({standing}) to the ideal ({ideal})"
         )
-    return [episodes, *(f"  {value}" for value in [*values, *_paper(OmegaConf.load(folder / CONFIG))])]
+    return [episodes, *(f"  {value}" for value in [*values, *_paper(folder)])]
 
 
-def _paper(cfg: Any) -> list[str]:
-    """Return a line with the paper's return of Table 2 for a transfer run, or none."""
-    assert isinstance(cfg, DictConfig)
-    reported = TABLE_2.get((cfg.task.name, cfg.character.name, cfg.method.name))
-    if cfg.stage.name != "transfer" or reported is None:
+def _paper(folder: Path) -> list[str]:
+    """Return a line with the paper's return of Table 2, or none if the run is not comparable."""
+    run = read_run(folder)
+    if not isinstance(run, Run) or not (paper := reported(run)):
         return []
-    return [f"paper {reported.mean:.3f} +- {reported.std:.3f} (training budget not stated)"]
+    return [f"paper {paper.mean:.3f} +- {paper.std:.3f} (training budget not stated)"]
 
 
 def _evaluation(folder: Path) -> dict[str, Any]:

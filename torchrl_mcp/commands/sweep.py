@@ -1,5 +1,6 @@
 """Sweeps that go on after a failed run, with every launcher and sweeper of Hydra."""
 
+import os
 import shlex
 import sys
 import traceback
@@ -23,8 +24,9 @@ class Sweep(Callback):
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Choose the folder of the logs."""
-        self.folder = Path(config.hydra.sweep.dir).absolute() / f"failed-{datetime.now():%Y-%m-%d-%H%M%S}"
+        """Choose the folder of the logs, not that of a sweep that begins in the same second."""
+        name = f"failed-{datetime.now():%Y-%m-%d-%H%M%S}-{os.getpid()}"
+        self.folder = Path(config.hydra.sweep.dir).absolute() / name
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the log of a failed run, and take its exception from Hydra."""

@@ -35,7 +35,7 @@ def mean(values: Sequence[float]) -> Estimate:
     Raises:
         ValueError: If there is no value.
     """
-    return _estimate([values], np.mean)
+    return _estimate([values], np.mean, len(values))
 
 
 def deviation(values: Sequence[float]) -> float:
@@ -65,7 +65,7 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
         equal = [np.repeat(sample, size // sample.shape[axis], axis=axis) for sample in samples]
         return np.asarray(trim_mean(np.concatenate(equal, axis=axis), 0.25, axis=axis))
 
-    return _estimate(strata, middle)
+    return _estimate(strata, middle, len(strata) * math.lcm(*map(len, strata)))
 
 
 def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Estimate:
@@ -89,7 +89,7 @@ def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[f
         signs = [np.sign(x[..., :, None] - y[..., None, :]).mean((-2, -1)) for x, y in tasks]
         return np.asarray(np.mean(signs, axis=0) / 2 + 0.5)
 
-    return _estimate([values for pair in pairs for values in pair], ahead)
+    return _estimate([values for pair in pairs for values in pair], ahead, sum(len(x) * len(y) for x, y in pairs))
 
 
 def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[str, ...] = ()) -> dict[str, float]:
@@ -99,7 +99,8 @@ def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[s
     return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
 
 
-def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray]) -> Estimate:
+def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray], size: int) -> Estimate:
+    """Return a statistic with its interval; ``size`` is the number of values that it makes of each resample."""
     from scipy.stats import bootstrap  # slow to import
 
     if not strata or not all(len(values) for values in strata):
@@ -113,7 +114,7 @@ def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.nda
         vectorized=True,
         method="percentile",
         confidence_level=CONFIDENCE,
-        batch=max(1, BATCH // sum(map(len, strata))),
+        batch=max(1, BATCH // size),
         rng=np.random.default_rng(0),
     ).confidence_interval
     return Estimate(value, float(interval.low), float(interval.high))

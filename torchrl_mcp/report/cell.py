@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, mean, shared_means
 from torchrl_mcp.report.paper import TABLE_2, Reported
-from torchrl_mcp.report.results import Run
+from torchrl_mcp.report.results import Run, leaves
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -165,7 +165,7 @@ class Cell:
             *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
             *(
                 f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, which training would not do"
-                for protocol, runs in grouped(others, lambda run: protocols([run])[0]).items()
+                for protocol, runs in grouped(others, _protocol).items()
             ),
             *(f"mixed {found}" for found in mixed("evaluations", protocols(self.complete))),
             *(f"mixed {found}" for found in mixed("pre-trainings", map(_pretraining, self.runs))),
@@ -195,7 +195,7 @@ def _target(name: str) -> str:
 
 def protocols(runs: Sequence[Run]) -> list[str]:
     """Return how each run was evaluated: its episodes, and settings of the environment that differ between runs."""
-    environments = [run.evaluation.get("environment", {}) for run in runs]
+    environments = [run.evaluation.get("environment") or {} for run in runs]
     telling = varying(environments)
     return [
         f"{run.evaluation.get('episodes', 'unknown')} episodes of seed {run.evaluation.get('seed', 'unknown')}"
@@ -210,12 +210,24 @@ def mixed(name: str, values: Iterable[str]) -> list[str]:
     return [f"{name}: {', '.join(found)}"] if len(found) > 1 else []
 
 
+def _protocol(run: Run) -> str:
+    """Return how a run was evaluated, with the settings of the task that its configuration has otherwise."""
+    return "".join([*protocols([run]), *(f" with {name}={value}" for name, value in _changed(run).items())])
+
+
+def _changed(run: Run) -> dict[str, Any]:
+    """Return the settings of the task in a run's evaluation that its configuration has otherwise."""
+    held = leaves(run.evaluation.get("environment") or {}, "evaluation.environment")
+    changed = {name: value for name, value in held if run.settings.get(name, value) != value}
+    return {name.removeprefix("evaluation.environment."): value for name, value in changed.items()}
+
+
 def _is_evaluated_otherwise(run: Run) -> bool:
-    """Return whether a run's evaluation has other episodes than its configuration says."""
+    """Return whether a run's evaluation has other episodes, or another task, than its configuration says."""
     names = ("episodes", "seed")
     planned = [run.settings.get(f"evaluation.{name}") for name in names]
     held = [run.evaluation.get(name) for name in names]
-    return bool(planned[0]) and None not in (*planned, *held) and planned != held
+    return bool(_changed(run)) or (bool(planned[0]) and None not in (*planned, *held) and planned != held)
 
 
 def _pretraining(run: Run) -> str:

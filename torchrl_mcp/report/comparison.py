@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchrl_mcp.report.cell import DEFAULT, Cell, grouped, mixed, protocols, varying
-from torchrl_mcp.report.paper import METHODS, PLACES
+from torchrl_mcp.report.paper import METHODS, PLACES, Reported
 from torchrl_mcp.report.results import Run
 from torchrl_mcp.runs.identity import PRETRAINING, UNLEARNT, is_among
 
@@ -61,6 +61,12 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
         for chosen in grouped(alike, lambda run: _frozen(choices(run))).values():
             found += _cells(chosen, telling)
     return sorted(found, key=_order)
+
+
+def reported(run: Run) -> Reported | None:
+    """Return the paper's figure for a run, if it has one."""
+    (cell,) = cells([run])
+    return cell.reported
 
 
 def methods(cells: Iterable[Cell]) -> dict[str, str]:

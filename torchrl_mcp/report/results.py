@@ -16,6 +16,7 @@ from torchrl_mcp.runs import configuration
 from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.trust import read_config
 from torchrl_mcp.training.run_folder import (
+    CHECKPOINTS,
     CONFIG,
     EVALUATION,
     METRICS,
@@ -33,6 +34,9 @@ SAID = {"choices": str, "machine": str | int}
 
 MOST_FRAMES = 1e15
 """Upper bound on environment steps, above any training."""
+
+BESIDE = {CHECKPOINTS, EVALUATION, PROVENANCE}
+"""What tells a run without metrics from a ``config.yaml`` of another program."""
 
 REQUIRED = {
     "task.name": str,
@@ -182,15 +186,15 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
     """Read the run folders in ``paths`` at any depth, each once, ordered by name.
 
     Raises:
-        ValueError: If a path does not exist or contains no run.
+        ValueError: If no path contains a run.
     """
     folders: dict[Path, Path] = {}
-    for path in paths:
-        found = sorted(_run_folders(path))
-        if not found:
-            raise ValueError(f"{path} holds no run: give run folders, with {CONFIG} and {METRICS}, or folders of them")
-        for folder in found:
+    for path in (paths := list(paths)):
+        for folder in sorted(_run_folders(path)):
             folders.setdefault(folder.resolve(), folder)
+    if not folders:
+        empty = " and ".join(f"{path} holds no run" for path in paths)
+        raise ValueError(f"{empty}: give run folders, with {CONFIG} and {METRICS}, or folders of them")
     outcomes = [read_run(folder) for folder in folders.values()]
     runs = [outcome for outcome in outcomes if isinstance(outcome, Run)]
     return runs, [outcome for outcome in outcomes if isinstance(outcome, Damaged)]
@@ -199,7 +203,7 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
 def read_run(folder: Path) -> Run | Damaged:
     """Read a run folder; errors in its files are returned, not raised."""
     try:
-        settings = dict(_leaves(translated(read_config(folder / CONFIG))))
+        settings = dict(leaves(translated(read_config(folder / CONFIG))))
     except FileNotFoundError:
         return Damaged(folder, f"has no {CONFIG}")
     except (OSError, ValueError) as error:
@@ -209,7 +213,7 @@ def read_run(folder: Path) -> Run | Damaged:
     if (total := settings["training.total_frames"]) < 1:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}: it must be at least 1")
     if "method.title" not in settings:  # an older run, without the method's title and standard settings
-        settings = dict(_leaves(_about(settings["method.name"]), "method")) | settings
+        settings = dict(leaves(_about(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
@@ -221,20 +225,26 @@ def read_run(folder: Path) -> Run | Damaged:
 
 
 def _run_folders(path: Path) -> Iterator[Path]:
-    for folder, subfolders, names in os.walk(path):
-        if CONFIG in names or METRICS in names:
+    """Yield the run folders in a folder, also those in other run folders and behind links, each once."""
+    visited = set()
+    for folder, subfolders, names in os.walk(path, followlinks=True):
+        if (real := os.path.realpath(folder)) in visited:
             subfolders.clear()
+            continue
+        visited.add(real)
+        if METRICS in names or (CONFIG in names and BESIDE & {*names, *subfolders}):
             yield Path(folder)
-        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+            subfolders[:] = [name for name in subfolders if name != CHECKPOINTS]
+        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Values of a nested dictionary with their dotted names."""
     if not isinstance(value, dict):
         yield name, value
         return
     for key, inner in value.items():
-        yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+        yield from leaves(inner, f"{name}.{key}" if name else str(key))
 
 
 def _progress(folder: Path) -> dict[str, Any]:
@@ -243,6 +253,8 @@ def _progress(folder: Path) -> dict[str, Any]:
         return {}
     if not all(0 <= row["frames"] < MOST_FRAMES for row in rows):
         raise ValueError(f"its frames are not numbers of steps below {MOST_FRAMES:.0e}")
+    if not math.isfinite(rows[-1]["seconds"]):
+        raise ValueError("its last row has no seconds")
     return {
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],

@@ -6,7 +6,7 @@ from itertools import cycle
 from statistics import fmean
 from typing import Any
 
-from torchrl_mcp.analysis.curves import learning_curves, plot_curves
+from torchrl_mcp.analysis.curves import labelled_curves, plot_curves
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, colours, new_figure
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.comparison import ablations, caveats, methods
@@ -244,7 +244,7 @@ def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], n
     if not drawn:
         return None
     figure = new_figure(4.8, 2.8)
-    curves = learning_curves({label: paths for paths, label, _ in drawn})
+    curves = labelled_curves([(label, paths) for paths, label, _ in drawn])
     plot_curves(figure.add_subplot(), curves, [{**style, "linewidth": 1.5} for *_, style in drawn])
     described = f"{title}: normalised return against environment steps, of {'; '.join(curve.label for curve in curves)}"
     svg = inline_svg(figure, name, described, PAGE_COLOURS)

@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
 from torchrl_mcp.evaluation.statistics import Estimate, interquartile_mean, probability_of_improvement
-from torchrl_mcp.report.cell import Cell
+from torchrl_mcp.report.cell import Cell, grouped
 from torchrl_mcp.report.comparison import methods
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
 
@@ -25,25 +25,21 @@ Place = tuple[str, str]
 def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
     """Return the cell that stands for each method in a row of Table 2.
 
-    Scratch stands with its longest runs, which may have the steps of both stages. The others stand with as many steps
-    as the shortest of their runs. Of several :func:`.choices` of a method, such as two kinds of exploration, the one
-    with the highest deterministic return stands for it; of cells with the same choices, that with the most seeds.
+    Scratch stands with its longest runs, which may have the steps of both stages, every other method with its shortest.
+    Of several :func:`.choices` of a method, such as two kinds of exploration, the one with the highest deterministic
+    return stands for it; of cells with the same choices, that with the most seeds.
 
     Args:
         cells: Cells of any task and stage.
         place: Task and character.
     """
     here = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
-    longest = max((cell.steps for cell in here if cell.method == "scratch"), default=0)
-    shortest = min((cell.steps for cell in here if cell.method != "scratch"), default=0)
-    most: dict[str, Cell] = {}
-    for cell in here:
-        if cell.steps == (longest if cell.method == "scratch" else shortest):
-            chosen = repr((cell.method, cell.choices))
-            most[chosen] = max(most.get(chosen, cell), cell, key=lambda cell: len(cell.by_seed))
-    best: dict[str, Cell] = {}
-    for cell in most.values():
-        best[cell.method] = max(best.get(cell.method, cell), cell, key=average)
+    best = {}
+    for method, alike in grouped(here, lambda cell: cell.method).items():
+        steps = (max if method == "scratch" else min)(cell.steps for cell in alike)
+        kinds = grouped((cell for cell in alike if cell.steps == steps), lambda cell: repr(cell.choices))
+        most = (max(kind, key=lambda cell: len(cell.by_seed)) for kind in kinds.values())
+        best[method] = max(most, key=average)
     return best
 
 
@@ -115,8 +111,8 @@ def over_rows(cells: Sequence[Cell]) -> tuple[list[Place], dict[str, Estimate]]:
 def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
     """Draw each method's interquartile mean, and how probable it is that a run of MCP is ahead of one of the method.
 
-    Means are those of :func:`over_rows`, the probability is over the rows that both have. Lines are 95 % bootstrap
-    intervals, where every row has two seeds or more.
+    Means are those of :func:`over_rows`, if there are any; the probability is over the rows that both have. Lines are
+    95 % bootstrap intervals, where every row has two seeds or more.
 
     Args:
         cells: Cells of any task and stage.
@@ -135,11 +131,12 @@ def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
         for name in others
     }
     figure = new_figure(7.5, 0.9 + 0.27 * len(named))
-    left, right = figure.subplots(1, 2)
+    panels = figure.subplots(1, 2 if means else 1, squeeze=False)[0]
     titles = {name: TITLES.get(name, title) for name, title in named.items()}
-    draw_estimates(left, means, titles, f"interquartile mean over {len(shared)} rows")
-    draw_estimates(right, ahead, titles, "probability that MCP is ahead")
-    right.axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
+    if means:
+        draw_estimates(panels[0], means, titles, f"interquartile mean over {len(shared)} rows")
+    draw_estimates(panels[-1], ahead, titles, "probability that MCP is ahead")
+    panels[-1].axvline(0.5, color=INK, linewidth=0.8, linestyle=":")
     return figure
 
 
@@ -150,7 +147,7 @@ def draw_estimates(axes: Axes, estimates: Mapping[str, Estimate], titles: Mappin
         axes.plot(estimate.value, position, "o", color=COLOURS[0], markersize=4)
     axes.set_yticks(range(len(estimates)), [titles[name] for name in estimates])
     axes.set_ylim(len(estimates) - 0.5, -0.5)
-    axes.set_xlim(0.0, 1.02)
+    axes.set_xlim(1.02 * min(0.0, axes.dataLim.x0), 1.02 * max(1.0, axes.dataLim.x1))
     axes.grid(axis="x", color="#EEEEEE")
     axes.set_xlabel(label, fontsize=9)
     bare(axes)

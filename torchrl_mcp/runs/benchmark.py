@@ -109,13 +109,14 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     settings, which several runs may share.
 
     Raises:
-        ValueError: If there are none, or two runs with different settings would share a folder.
+        ValueError: If there are none, no row has a value, or two runs with different settings would share a folder.
     """
     params = [f"{key}={value}" for key, value in master.benchmark.get("params", {}).items()]
     given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
     overrides = OverridesParser.create(config_loader=loader).parse_overrides([*params, *given])
     choices = {override.get_key_element(): values(override) for override in overrides}
     rows: Any = OmegaConf.to_container(master.benchmark.rows)
+    require_in_rows(rows, choices)
     pretraining: dict[tuple[str, ...], Job] = {}
     transfer: list[Job] = []
     for settings in expand(rows, choices):
@@ -145,6 +146,18 @@ def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Se
         others = {key: choice for key, choice in choices.items() if key not in row}
         for combination in product(*selected.values(), *others.values()):
             yield dict(zip([*selected, *others], combination, strict=True))
+
+
+def require_in_rows(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> None:
+    """Check that every chosen value fits a row.
+
+    Raises:
+        ValueError: If all rows have the key, and none the value.
+    """
+    for key in (key for key in choices if all(key in row for row in rows)):
+        known = dict.fromkeys(str(value) for row in rows for value in row[key])
+        if unknown := [value for value in choices[key] if value not in known]:
+            raise ValueError(f"no row of the benchmark has {key}={','.join(unknown)}: give some of {','.join(known)}")
 
 
 def values(override: Override) -> list[str]:
