@@ -23,9 +23,9 @@ from torchrl_mcp.analysis.figures import save_figure
 from torchrl_mcp.report.cell import DEFAULT, Cell
 from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.paper import PLACES
-from torchrl_mcp.report.results import MODES, Run, find_runs
+from torchrl_mcp.report.results import Run, find_runs
 from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, NORMALISED_RETURN, PROVENANCE, replacing
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, MODES, NORMALISED_RETURN, PROVENANCE, replacing
 
 ARCHIVE = "runs.tar.xz"
 CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)

@@ -12,7 +12,7 @@ from typing import Any
 from torchrl_mcp.cli.parsing import add_task, add_trust, count, explained, new_parser, seed, settings
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import locate
-from torchrl_mcp.training.run_folder import write_json
+from torchrl_mcp.training.run_folder import MODES, write_json
 
 PROGRAM = "torchrl-mcp-evaluate"
 
@@ -41,7 +41,7 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
     from torchrl_mcp.runs.tables import text_table
 
     print(f"{arguments.checkpoint}: {arguments.episodes} episodes, seed {arguments.seed}")
-    for mode in ("deterministic", "stochastic"):
+    for mode in MODES:
         numbers = results[mode]
         low, high = numbers["interval"]
         print(

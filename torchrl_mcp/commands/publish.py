@@ -14,7 +14,7 @@ from torchrl_mcp.runs import policies, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.identity import CONDUCT, is_among
 from torchrl_mcp.training import checkpoint, run_folder
-from torchrl_mcp.training.run_folder import PROVENANCE, read_json
+from torchrl_mcp.training.run_folder import MODES, PROVENANCE, read_json
 
 PLACES = ("run_dir=", "run_root=", "resume=")
 """Prefixes of arguments that only concern the machine of the run."""
@@ -66,7 +66,7 @@ def model_card(
     """
     name = path.stem.removeprefix("mcp-")
     checkpoint_name = f"{PREFIX}{name}" if path.parent.resolve() == FOLDER.resolve() else path.name
-    returns = "\n".join(f"- {mode}: {_returns(numbers[mode])}" for mode in ("deterministic", "stochastic"))
+    returns = "\n".join(f"- {mode}: {_returns(numbers[mode])}" for mode in MODES)
     character = CHARACTERS.get(cfg.character.name, cfg.character.name)
     return f"""\
 # {name}

@@ -9,7 +9,7 @@ from torchrl_mcp.report.comparison import reported
 from torchrl_mcp.report.results import Run, read_run
 from torchrl_mcp.runs import quoting
 from torchrl_mcp.runs.trust import trust_options
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, MODES, NORMALISED_RETURN, read_metrics
 
 
 def summary(folder: Path) -> str:
@@ -43,7 +43,7 @@ def _returns(folder: Path) -> list[str]:
         last = last_return(folder)
         shown = "none, since no episode of full length has ended" if last is None else f"{last:.3f}"
         return [f"normalised return in training: {shown}"]
-    modes = {mode: evaluation[mode] for mode in ("deterministic", "stochastic")}
+    modes = {mode: evaluation[mode] for mode in MODES}
     values = [
         "{} {:.3f} ({:.3f} to {:.3f})".format(mode, numbers["normalised_return"], *numbers["interval"])
         for mode, numbers in modes.items()

@@ -12,7 +12,7 @@ from torchrl_mcp import __version__
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.comparison import cells, methods
 from torchrl_mcp.report.paper import TABLE_2
-from torchrl_mcp.report.results import MODES, STATES, Damaged, Run
+from torchrl_mcp.report.results import STATES, Damaged, Run
 from torchrl_mcp.report.sections import (
     PAGE_COLOURS,
     Row,
@@ -27,6 +27,7 @@ from torchrl_mcp.report.sections import (
 from torchrl_mcp.report.svg import inline_svg
 from torchrl_mcp.report.table_2 import describe, draw_table_2, over_rows
 from torchrl_mcp.training import precision
+from torchrl_mcp.training.run_folder import MODES
 
 PAGES = ("report.html", "report.md")
 

@@ -20,13 +20,13 @@ from torchrl_mcp.training.run_folder import (
     CONFIG,
     EVALUATION,
     METRICS,
+    MODES,
     NORMALISED_RETURN,
     PROVENANCE,
     read_json,
     read_metrics,
 )
 
-MODES = ("deterministic", "stochastic")
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
 
 SAID = {"choices": str, "machine": str | int}

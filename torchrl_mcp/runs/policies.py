@@ -19,6 +19,7 @@ from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
 from torchrl_mcp.training import checkpoint
+from torchrl_mcp.training.run_folder import MODES
 
 
 def policy_config(path: Path) -> DictConfig:
@@ -110,7 +111,7 @@ def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[s
     settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     environment = {**settings["environment"], **kwargs}
     results: dict[str, Any] = {"episodes": episodes, "seed": seed, "environment": environment}
-    for mode in ("deterministic", "stochastic"):
+    for mode in MODES:
         _, agent, env = restore(path, num_envs=episodes, seed=seed, **environment)
         torch.manual_seed(seed)
         record = diagnosed(agent.actor)

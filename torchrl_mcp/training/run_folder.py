@@ -24,6 +24,9 @@ NORMALISED_RETURN = "episode/normalised_return"
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""
 
+MODES = ("deterministic", "stochastic")
+"""How the policy chooses its actions in an evaluation; the names of its parts."""
+
 PROVENANCE = "origin.json"
 """The run's provenance: command, commit, versions and machine."""
 
