@@ -1,0 +1,31 @@
+"""Adam with smaller steps in layers with many inputs, whose units would otherwise die (:mod:`.dead_units`)."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: int, **kwargs: Any) -> torch.optim.Adam:
+    r"""Return Adam whose step size for the weights of a layer with :math:`n` inputs is :math:`\alpha \min(1, m / n)`.
+
+    Adam moves every weight by about its step size, however small the gradient. The inputs of a layer after rectifiers
+    are not negative, so that one step can move a unit's sum by the step size times the sum of all inputs. At first the
+    steps of many minibatches agree, and a few of them make the unit zero for all samples: it is dead.
+
+    Args:
+        parameters: Parameters of linear layers: weights ``(outputs, n)`` and biases ``(outputs,)``.
+        lr: Step size :math:`\alpha` of biases and of layers with at most ``inputs`` inputs.
+        inputs: Number of inputs :math:`m` above which steps are smaller.
+        **kwargs: Other arguments of :class:`torch.optim.Adam`.
+
+    Reference:
+        Yang et al., *Tensor Programs V*, 2022, Table 3: hidden layers need steps of Adam in proportion to
+        :math:`1 / n`. https://arxiv.org/abs/2203.03466
+    """
+    groups: dict[float, list[Tensor]] = {}
+    for parameter in parameters:
+        share = min(1.0, inputs / parameter.shape[1]) if parameter.ndim > 1 else 1.0
+        groups.setdefault(lr * share, []).append(parameter)
+    return torch.optim.Adam([{"params": group, "lr": size} for size, group in groups.items()], **kwargs)
