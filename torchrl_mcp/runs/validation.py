@@ -77,7 +77,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
         num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor lengths.none lengths.mixed
         checkpoint_interval keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options
-        latent_dim steps_per_choice explorer.steps critic.inputs
+        latent_dim steps_per_choice explorer.steps step_size.inputs critic.inputs
     """,
     COUNT.or_null(): "torch_threads record_interval",
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
