@@ -100,7 +100,12 @@ def read_smpl(path: str | Path, *, body_model: str | Path | None = None, fps: fl
 def _vectors(archive: Archive) -> Tensor:
     """Rotation vectors of the joints, one after the other, shape ``(T, 66)``."""
     if "poses" not in archive.names:
-        return torch.cat([archive.numbers("root_orient", 3), archive.numbers("pose_body", 63)], dim=-1)
+        root, body = archive.numbers("root_orient", 3), archive.numbers("pose_body", 63)
+        if len(root) != len(body):
+            raise archive.error(
+                f"has {len(root)} rotations in root_orient and {len(body)} in pose_body: they should be equally many"
+            )
+        return torch.cat([root, body], dim=-1)
     poses = archive.numbers("poses")
     poses = poses.flatten(1) if poses.ndim > 1 else poses
     if poses.ndim != 2 or poses.shape[1] not in NUMBERS or len(poses) < 2:

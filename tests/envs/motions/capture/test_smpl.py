@@ -214,6 +214,12 @@ def test_a_body_model_of_another_kind_is_refused(write, tmp_path):
         import_motion(write(**GOOD, betas=np.zeros(10)), "humanoid", body_model=tmp_path / "nowhere.npz")
 
 
+def test_rotations_of_root_and_body_are_equally_many(write):
+    parts = {"root_orient": np.zeros((3, 3)), "pose_body": np.zeros((5, 63)), "trans": np.zeros((5, 3))}
+    with pytest.raises(MotionFormatError, match="has 3 rotations in root_orient and 5 in pose_body"):
+        import_motion(write(**parts, mocap_frame_rate=30), "humanoid")
+
+
 def test_an_archive_of_something_else_is_refused_with_its_arrays(write):
     with pytest.raises(MotionFormatError, match="has the arrays images, labels: pass poses and trans of SMPL's bodies"):
         import_motion(write(images=np.zeros(3), labels=np.zeros(3)), "humanoid")
