@@ -29,6 +29,11 @@ def test_the_first_step_of_each_layer_has_its_size():
     assert biases == pytest.approx([1e-3] * 3, rel=1e-3)
 
 
+def test_without_a_bound_all_layers_have_equal_steps():
+    (group,) = layerwise_adam(mlp(16, 128, 1).parameters(), lr=1e-3, inputs=float("inf")).param_groups
+    assert group["lr"] == 1e-3
+
+
 def test_arguments_reach_adam():
     optimizer = layerwise_adam(mlp(2, 64, 1).parameters(), lr=1e-3, inputs=32, betas=(0.5, 0.6))
     assert type(optimizer) is torch.optim.Adam
@@ -36,7 +41,7 @@ def test_arguments_reach_adam():
 
 
 def dead_units(make_optimizer):
-    """Share of dead units after 100 steps of regression from 100 numbers, of as many targets as a batch of returns."""
+    """Share of dead units after 100 steps of regression on 4,096 samples of 100 numbers."""
     torch.manual_seed(0)
     network = mlp(100, 512, 256, 1)
     optimizer = make_optimizer(network.parameters())

@@ -77,7 +77,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
     COUNT: """
         num_envs frames_per_batch minibatch_size num_epochs total_frames batch_factor lengths.none lengths.mixed
         checkpoint_interval keep_checkpoints max_episode_steps num_workers switch_candidates num_primitives num_options
-        latent_dim steps_per_choice explorer.steps step_size.inputs critic.inputs
+        latent_dim steps_per_choice explorer.steps
     """,
     COUNT.or_null(): "torch_threads record_interval",
     WHOLE: "num_threads branch_cells warmup_batches evaluation.episodes",
@@ -87,7 +87,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         action_std initial_std std logits_std scale max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
-    PERIOD: "switch_interval speed_interval",
+    PERIOD: "switch_interval speed_interval step_size.inputs critic.inputs",
     SPEED: "speed",
     NOT_NEGATIVE: """
         bound_coeff coeff kl_coeff termination_cost weight max_turn

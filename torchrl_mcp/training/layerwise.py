@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 
-def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: int, **kwargs: Any) -> torch.optim.Adam:
+def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: float, **kwargs: Any) -> torch.optim.Adam:
     r"""Return Adam whose step size for the weights of a layer with :math:`n` inputs is :math:`\alpha \min(1, m / n)`.
 
     Adam moves every weight by about its step size, however small the gradient. The inputs of a layer after rectifiers
@@ -17,7 +17,7 @@ def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: int, **kw
     Args:
         parameters: Parameters of linear layers: weights ``(outputs, n)`` and biases ``(outputs,)``.
         lr: Step size :math:`\alpha` of biases and of layers with at most ``inputs`` inputs.
-        inputs: Number of inputs :math:`m` above which steps are smaller.
+        inputs: Number of inputs :math:`m` above which steps are smaller; infinity for equal steps.
         **kwargs: Other arguments of :class:`torch.optim.Adam`.
 
     Reference:
