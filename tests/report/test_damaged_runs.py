@@ -73,10 +73,12 @@ def test_what_the_environment_holds_does_not_get_into_a_report(write_run, tmp_pa
 
 
 def test_the_command_writes_both_pages_and_the_picture(varied_runs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(varied_runs), "--output", str(tmp_path / "a" / "b")])
+    (note := tmp_path / "note.txt").touch()  # as the shell's runs/* may match
+    output = tmp_path / "a" / "b"
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-report", str(varied_runs), str(note), "--output", str(output)])
     main()
     assert capsys.readouterr().out.startswith("16 runs, 12 complete, 1 not evaluated, 1 unfinished, 2 damaged: ")
-    found = sorted(path.name for path in (tmp_path / "a" / "b").iterdir())
+    found = sorted(path.name for path in output.iterdir())
     assert found == ["report.html", "report.md", "table_2.png", "table_2.svg"]
 
 

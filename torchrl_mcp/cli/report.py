@@ -16,7 +16,7 @@ PROGRAM = "torchrl-mcp-report"
 def main() -> None:
     """Read run folders and write the report."""
     arguments = parser().parse_args()
-    if missing := [str(path) for path in arguments.runs if not path.is_dir()]:
+    if missing := [str(path) for path in arguments.runs if not path.exists()]:
         sys.exit(f"{PROGRAM}: there is no folder {' and no folder '.join(missing)}")
     announce(PROGRAM)
     from torchrl_mcp.analysis.figures import save_figure
