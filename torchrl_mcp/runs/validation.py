@@ -55,7 +55,10 @@ NOT_NEGATIVE = Rule("a finite number, at least 0", lambda value: _is_number(valu
 SHARE = Rule("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1)
 DISCOUNT = Rule("a number from 0 to 1, below 1", lambda value: _is_number(value) and 0 <= value < 1)
 PROBABILITY = Rule("a number between 0 and 1", lambda value: _is_number(value) and 0 < value < 1)
-PERIOD = Rule("a number above 0, or .inf", lambda value: value == math.inf or POSITIVE.allows(value))
+PERIOD = Rule(
+    "a number above 0, or infinity (inf; in files and --task .inf)",
+    lambda value: value == math.inf or POSITIVE.allows(value),
+)
 FLAG = Rule("true or false", lambda value: isinstance(value, bool))
 TEXT = Rule("a text", lambda value: isinstance(value, str) and bool(value))
 WIDTHS = Rule(
