@@ -25,9 +25,6 @@ class Primitives(nn.Module):
         width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
-        std_inputs: Number of inputs :math:`m` above which the output layer for :math:`\log \sigma`, of :math:`n`
-            inputs, is multiplied by :math:`m / n`. Adam moves every weight by about its step size, so that the noise
-            would otherwise change many times as fast as a :math:`\log \sigma` that is a parameter itself.
 
     Raises:
         ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
@@ -47,7 +44,6 @@ class Primitives(nn.Module):
         width: float = 1.0,
         initial_std: float = 1.0,
         output_gain: float = 1.0,
-        std_inputs: float = math.inf,
     ) -> None:
         super().__init__()
         if num_primitives < 1:
@@ -59,13 +55,11 @@ class Primitives(nn.Module):
         self.trunk = relu_mlp(observation_dim, trunk_cells)
         self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
         self.rectifier = nn.ReLU() if branch_cells else nn.Identity()
-        num_features = branch_cells or trunk_cells[-1]
-        self.output = BatchedLinear(num_primitives, num_features, 2 * action_dim)
-        self.std_gain = min(1.0, std_inputs / num_features)
+        self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], 2 * action_dim)
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
             self.output.bias.zero_()
-            self.output.bias[:, action_dim:] = math.log(initial_std) / self.std_gain
+            self.output.bias[:, action_dim:] = math.log(initial_std)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
@@ -73,7 +67,7 @@ class Primitives(nn.Module):
         if self.branches is not None:
             features = self.rectifier(self.branches(features))
         loc, log_scale = self.output(features).chunk(2, dim=-1)
-        return loc, (self.std_gain * at_least_single(log_scale)).exp()
+        return loc, at_least_single(log_scale).exp()
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
@@ -81,7 +75,7 @@ class Primitives(nn.Module):
         action_dim = self.output.bias.shape[-1] // 2
         self.output.weight[..., :action_dim] *= factor
         self.output.bias[:, :action_dim] *= factor
-        self.output.bias[:, action_dim:] += math.log(factor) / self.std_gain
+        self.output.bias[:, action_dim:] += math.log(factor)
 
 
 class BatchedLinear(nn.Module):

@@ -1,6 +1,5 @@
 """The configuration of a run: composed by Hydra, checked, and completed to the plan of a run."""
 
-import math
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +50,7 @@ def planned(cfg: DictConfig) -> Plan:
     require_used(cfg)
     where = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _sizes(cfg, initial)))
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _widths(cfg, initial)))
     return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
 
 
@@ -84,11 +83,11 @@ def initial_networks(cfg: DictConfig) -> Path | None:
     return checkpoint.find(Path(cfg.pretrained))
 
 
-def _sizes(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
-    """Return the widths of the networks that a run takes from a checkpoint file, and how their noise is scaled."""
+def _widths(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
+    """Return the widths of the networks that a run takes from a checkpoint file."""
     if initial is None:
         return {}
     saved = checkpoint.saved_config(initial)
     width = saved.get("width", 1.0)  # older networks have the paper's
-    kept = {"kept_width": saved.get("kept_width", width), "kept_inputs": saved.get("kept_inputs", math.inf)}
+    kept = {"kept_width": saved.get("kept_width", width)}
     return kept if cfg.stage.name == "transfer" else {**kept, "width": width}

@@ -90,7 +90,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         action_std initial_std std logits_std scale max_error width kept_width
     """,
     POSITIVE.or_null(): "max_grad_norm physics_timestep",
-    PERIOD: "switch_interval speed_interval step_size.inputs critic.inputs kept_inputs std_inputs",
+    PERIOD: "switch_interval speed_interval step_size.inputs critic.inputs",
     SPEED: "speed",
     NOT_NEGATIVE: """
         bound_coeff coeff kl_coeff termination_cost weight max_turn
