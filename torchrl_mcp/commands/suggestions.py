@@ -3,7 +3,7 @@
 import difflib
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 from hydra import compose, initialize_config_module
@@ -70,10 +70,15 @@ def suggestions(settings: Sequence[str]) -> list[str]:
     return [
         f"{key!r} is in no file, but is a valid argument: write it with a plus, +{key}=..."
         if _is_argument(key, cfg)
-        else f"{key!r} is no setting of this method; the nearest are: "
-        + ", ".join(difflib.get_close_matches(key, {*groups, *known}, n=3, cutoff=0.5) or sorted(groups))
+        else f"{key!r} is no setting of this method" + _nearest(key, {*groups, *known})
         for key in unknown
     ]
+
+
+def _nearest(key: str, known: Collection[str]) -> str:
+    """Return the end of a sentence with the nearest known keys."""
+    near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+    return f"; the nearest are: {', '.join(near)}" if near else ": torchrl-mcp-train --cfg job prints all"
 
 
 def _is_readable(word: str) -> bool:
