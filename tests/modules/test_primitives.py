@@ -55,8 +55,30 @@ def test_with_a_small_gain_every_primitive_starts_at_zero_mean_and_its_initial_s
     torch.testing.assert_close(scale, torch.full_like(scale, initial_std), atol=0, rtol=0.02)
 
 
-def test_means_and_standard_deviations_are_rescaled_together():
-    primitives = Primitives(27, 8, 3)
+def test_a_gain_slows_down_what_adam_does_to_deviations():
+    def change(std_gain):
+        torch.manual_seed(0)
+        primitives = Primitives(3, 2, 4, trunk_cells=(7, 6), branch_cells=64, std_gain=std_gain)
+        states = torch.randn(100, 3)
+        optimizer = torch.optim.Adam(primitives.output.parameters(), lr=1e-3)
+        _, before = primitives(states)
+        before.log().sum().backward()
+        optimizer.step()
+        return (primitives(states)[1].log() - before.log()).detach()
+
+    whole = change(1.0)
+    torch.testing.assert_close(change(0.25), whole / 4, atol=1e-6, rtol=1e-3)
+    assert (whole < -2e-3).all()  # a parameter would have moved by 0.001
+
+
+def test_deviations_begin_alike_with_any_gain():
+    _, scale = Primitives(27, 8, 8, initial_std=0.3, output_gain=0.01, std_gain=0.1)(torch.randn(100, 27))
+    torch.testing.assert_close(scale, torch.full_like(scale, 0.3), atol=0, rtol=0.02)
+
+
+@pytest.mark.parametrize("std_gain", [1.0, 0.1])
+def test_means_and_standard_deviations_are_rescaled_together(std_gain):
+    primitives = Primitives(27, 8, 3, std_gain=std_gain)
     states = torch.randn(10, 27)
     before = primitives(states)
     primitives.rescale(2.5)
@@ -81,7 +103,13 @@ def test_standard_deviations_stay_float32_under_autocast():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("num_primitives", 0), ("initial_std", 0.0), ("initial_std", -0.1), ("initial_std", float("nan"))],
+    [
+        ("num_primitives", 0),
+        ("initial_std", 0.0),
+        ("initial_std", -0.1),
+        ("initial_std", float("nan")),
+        ("std_gain", 0.0),
+    ],
 )
 def test_impossible_arguments_are_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name):

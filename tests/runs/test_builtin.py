@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.runs import build, builtin, experiment, policies, publish, records
+from torchrl_mcp.runs import build, builtin, configuration, experiment, policies, publish, records
 from torchrl_mcp.training import checkpoint
 
 BIPED = ["method=mcp", "character=biped", "task=imitation", "stage=pretrain"]
@@ -20,7 +20,9 @@ def _log_elsewhere(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A walker's first steps."""
-    return experiment.train(configure(tmp_path_factory.mktemp("walker") / "run", *BIPED, "motions=single"))
+    return experiment.train(
+        configure(tmp_path_factory.mktemp("walker") / "run", *BIPED, "motions=single", "std_gain=0.5")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +83,21 @@ def test_loaded_networks_keep_their_width_and_new_ones_have_the_runs(run, publis
     assert hidden == {"primitives": first_layer(original.parts["primitives"]), "gating": 64}  # an eighth of 512
     longer = configure(tmp_path / "longer", *BIPED, "width=0.125", "training.total_frames=128", f"pretrained={run}")
     assert records.run_config(experiment.train(longer)).width == 0.0625
+
+
+def test_loaded_networks_keep_the_scale_of_their_deviations(run, tmp_path):
+    transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", f"pretrained={run}"]
+    folder = experiment.train(configure(tmp_path / "gate", *transfer, "training.total_frames=128"))
+    _, agent, _ = policies.restore(folder, num_envs=1, seed=0)
+    _, original, _ = policies.restore(run, num_envs=1, seed=0)
+    states = torch.randn(10, original.parts["primitives"].trunk[0].in_features)
+    torch.testing.assert_close(agent.parts["primitives"](states), original.parts["primitives"](states))
+    assert records.run_config(folder).std_gain == records.run_config(run).std_gain == 0.5
+
+
+def test_networks_of_earlier_versions_keep_theirs(tmp_path):
+    transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
+    assert configuration.planned(configure(tmp_path / "run", *transfer)).cfg.std_gain == 1
 
 
 def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):

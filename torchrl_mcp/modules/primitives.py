@@ -25,9 +25,12 @@ class Primitives(nn.Module):
         width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
+        std_gain: Factor on the output layer for :math:`\log \sigma`. Adam moves every weight by about its step size, so
+            that with a factor of 1 the noise changes many times as fast as a :math:`\log \sigma` that is a parameter
+            itself; smaller factors slow it down.
 
     Raises:
-        ValueError: If ``num_primitives`` or ``initial_std`` is not positive.
+        ValueError: If ``num_primitives``, ``initial_std`` or ``std_gain`` is not positive.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Figure 3, Eq. 4 and Section E.6. https://arxiv.org/abs/1905.09808
@@ -44,22 +47,25 @@ class Primitives(nn.Module):
         width: float = 1.0,
         initial_std: float = 1.0,
         output_gain: float = 1.0,
+        std_gain: float = 1.0,
     ) -> None:
         super().__init__()
         if num_primitives < 1:
             raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
-        if not initial_std > 0:
-            raise ValueError(f"initial_std must be positive, got {initial_std}")
+        for name, value in (("initial_std", initial_std), ("std_gain", std_gain)):
+            if not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
         trunk_cells = scaled_cells(trunk_cells, width)
         branch_cells = scaled_cells([branch_cells], width)[0] if branch_cells else 0
         self.trunk = relu_mlp(observation_dim, trunk_cells)
         self.branches = BatchedLinear(num_primitives, trunk_cells[-1], branch_cells) if branch_cells else None
         self.rectifier = nn.ReLU() if branch_cells else nn.Identity()
         self.output = BatchedLinear(num_primitives, branch_cells or trunk_cells[-1], 2 * action_dim)
+        self.std_gain = std_gain
         with torch.no_grad():
             self.output.weight.mul_(output_gain)
             self.output.bias.zero_()
-            self.output.bias[:, action_dim:] = math.log(initial_std)
+            self.output.bias[:, action_dim:] = math.log(initial_std) / std_gain
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``."""
@@ -67,7 +73,7 @@ class Primitives(nn.Module):
         if self.branches is not None:
             features = self.rectifier(self.branches(features))
         loc, log_scale = self.output(features).chunk(2, dim=-1)
-        return loc, at_least_single(log_scale).exp()
+        return loc, (self.std_gain * at_least_single(log_scale)).exp()
 
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
@@ -75,7 +81,7 @@ class Primitives(nn.Module):
         action_dim = self.output.bias.shape[-1] // 2
         self.output.weight[..., :action_dim] *= factor
         self.output.bias[:, :action_dim] *= factor
-        self.output.bias[:, action_dim:] += math.log(factor)
+        self.output.bias[:, action_dim:] += math.log(factor) / self.std_gain
 
 
 class BatchedLinear(nn.Module):

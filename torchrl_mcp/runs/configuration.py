@@ -50,7 +50,7 @@ def planned(cfg: DictConfig) -> Plan:
     require_used(cfg)
     where = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _widths(cfg, initial)))
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _sizes(cfg, initial)))
     return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
 
 
@@ -83,11 +83,11 @@ def initial_networks(cfg: DictConfig) -> Path | None:
     return checkpoint.find(Path(cfg.pretrained))
 
 
-def _widths(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
-    """Return the widths of the networks that a run takes from a checkpoint file."""
+def _sizes(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
+    """Return the widths of the networks that a run takes from a checkpoint file, and how their noise is scaled."""
     if initial is None:
         return {}
     saved = checkpoint.saved_config(initial)
     width = saved.get("width", 1.0)  # older networks have the paper's
-    kept = {"kept_width": saved.get("kept_width", width)}
+    kept = {"kept_width": saved.get("kept_width", width), "std_gain": saved.get("std_gain", 1.0)}
     return kept if cfg.stage.name == "transfer" else {**kept, "width": width}
