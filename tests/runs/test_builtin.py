@@ -97,7 +97,13 @@ def test_loaded_networks_keep_the_scale_of_their_deviations(run, tmp_path):
 
 def test_networks_of_earlier_versions_keep_theirs(tmp_path):
     transfer = ["method=mcp", "character=biped", "task=heading", "stage=transfer", "pretrained=builtin"]
-    assert configuration.planned(configure(tmp_path / "run", *transfer)).cfg.std_gain == 1
+    assert configuration.planned(configure(tmp_path / "run", *transfer, "std_gain=0.5")).cfg.std_gain == 1
+
+
+@pytest.mark.parametrize(("preset", "gain"), [("fast", 0.1), ("comparison", 1), ("paper", 1)])
+def test_the_ant_has_a_gain_but_not_in_table_2_nor_as_in_the_paper(preset, gain):
+    cfg = configuration.compose_run("method=mcp", "task=holdout", "stage=pretrain", f"preset={preset}")
+    assert cfg.std_gain == gain
 
 
 def test_pre_training_goes_on_from_another_with_other_motions(run, published, tmp_path):
