@@ -223,12 +223,6 @@ def test_the_shares_of_time_add_up_to_the_whole(pretrained):
             assert sum(shares.values()) == pytest.approx(1.0)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_the_learner_runs_on_a_gpu_beside_physics_on_the_cpu(tmp_path):
-    experiment.train(configure(tmp_path / "run", "device=cuda"))
-    assert all(value.isfinite().all() for value in final_parts(tmp_path / "run").values())
-
-
 @pytest.mark.parametrize(
     "overrides", [["method=mcp"], ["method=finetune", "task=imitation"], ["method=option_critic"]], ids=" ".join
 )

@@ -12,6 +12,8 @@ from torchrl_mcp.envs.motions import generated_library
 from torchrl_mcp.envs.tasks import holdout
 
 NUM_ENVS = 8
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+"""Of MuJoCo Warp; MuJoCo's threads stay on the CPU."""
 TASKS = {"heading": Heading, "carry": Carry, "dribble": Dribble}
 TERMS = {"bodies": {"weight": 0.5, "scale": 10.0}, "velocity": {"weight": 0.5, "scale": 0.1}}
 
@@ -23,6 +25,8 @@ def _needs_warp():
 
 def _make(scene, character="biped", num_envs=NUM_ENVS, **kwargs):
     kwargs = {"seed": 0, "num_threads": 1, **kwargs}
+    if kwargs.get("physics") == "warp":
+        kwargs["device"] = DEVICE
     if scene == "holdout":
         cone = kwargs.pop("friction_cone", "pyramidal")
         with patch.object(holdout, "ant", lambda: _with_cone(ant(), cone)):
@@ -48,7 +52,7 @@ def actions():
     """Draws random actions."""
     return lambda env, num, scale=0.3, seed=1: (
         scale * (2 * torch.rand(num, *env.action_spec.shape, generator=torch.Generator().manual_seed(seed)) - 1)
-    )
+    ).to(env.device)
 
 
 @pytest.fixture(scope="session")

@@ -30,18 +30,19 @@ def states(make, held, engines):
 
 def require_same(engines):
     for name, tolerance in TOLERANCES.items():
-        ours, exact = (env.simulation.state[name].double() for env in engines)
+        ours, exact = (env.simulation.state[name].cpu().double() for env in engines)
         torch.testing.assert_close(ours, exact, atol=tolerance, rtol=0)
 
 
 def gaps(env):
     """Metres between the carrier and the box."""
     bodies, places = env.simulation.model.body, env.simulation.outputs["xpos"]
-    return torch.linalg.vector_norm(places[:, bodies(env.character.carrier).id] - places[:, bodies("box").id], dim=-1)
+    apart = places[:, bodies(env.character.carrier).id] - places[:, bodies("box").id]
+    return torch.linalg.vector_norm(apart, dim=-1).cpu()
 
 
 def test_each_simulation_holds_its_own_box_in_the_air_as_on_mujocos_threads(engines, states, actions):
-    steps = [env.reset(states[0].clone(), set_state=True) for env in engines]
+    steps = [env.reset(states[0].clone().to(env.device), set_state=True) for env in engines]
     begun = gaps(engines[0])
     assert len(begun.round(decimals=3).unique()) == 8
     for index, action in enumerate(actions(engines[1], NUM_STEPS)):
@@ -49,13 +50,16 @@ def test_each_simulation_holds_its_own_box_in_the_air_as_on_mujocos_threads(engi
             for env in engines:
                 env.simulation.state["eq_active"][2] = 0
         if index == RESET:
-            before, one = engines[0].get_state(), torch.arange(8).unsqueeze(-1) == 5
-            steps = [env.reset(states[1].clone().set("_reset", one), set_state=True) for env in engines]
-            after, others = engines[0].get_state(), ~one.flatten()
+            before, one = engines[0].get_state().cpu(), torch.arange(8).unsqueeze(-1) == 5
+            steps = [env.reset(states[1].clone().set("_reset", one).to(env.device), set_state=True) for env in engines]
+            after, others = engines[0].get_state().cpu(), ~one.flatten()
             assert all(torch.equal(value[others], before[key][others]) for key, value in after.items())
             assert not torch.equal(after["eq_data"][5], before["eq_data"][5])
             begun[5] = gaps(engines[0])[5]
-        steps = [env.step(step.set("action", action))["next"] for env, step in zip(engines, steps, strict=True)]
+        steps = [
+            env.step(step.set("action", action.to(env.device)))["next"]
+            for env, step in zip(engines, steps, strict=True)
+        ]
         require_same(engines)
     moved = (gaps(engines[0]) - begun).abs()
     assert moved[2] > 0.03

@@ -6,6 +6,8 @@ from tensordict import TensorDict
 
 from torchrl_mcp.envs.physics.warp import WarpSimulation, constraint_room, contact_room
 
+exact = pytest.mark.skipif(torch.cuda.is_available(), reason="on a GPU threads add up in any order")
+
 
 @pytest.fixture
 def env(make):
@@ -19,6 +21,13 @@ def copied(simulation):
 def rows_equal(one, other, rows):
     for name, field in one.items():
         assert torch.equal(field[rows], other[name][rows]), name
+
+
+def rows_agree(one, other, rows):
+    """Require the same numbers; on a GPU, where threads add up in any order, nearly the same."""
+    for name, field in one.items():
+        tolerance = 1e-2 if field.is_cuda and field.is_floating_point() else 0.0
+        torch.testing.assert_close(field[rows], other[name][rows], atol=tolerance, rtol=tolerance, msg=name)
 
 
 def play(env, state, script):
@@ -56,7 +65,7 @@ def test_a_control_without_meaning_is_a_fault_that_no_other_simulation_notices(m
     assert env.simulation.step(spoiled).tolist() == [5]
     assert twin.simulation.step(script[3]).tolist() == []
     after, others = copied(env.simulation), [0, 1, 2, 3, 4, 6, 7]
-    rows_equal(after, copied(twin.simulation), others)
+    rows_agree(after, copied(twin.simulation), others)
     rows_equal(after, before, [5])
 
 
@@ -66,7 +75,7 @@ def test_a_diverging_simulation_ends_its_own_episode_only(env):
     state["qvel"][2] = 1e9
     start = env.reset(state, set_state=True)
     before = start["observation"].clone()
-    outcome = env.step(start.set("action", torch.zeros(env.action_spec.shape)))["next"]
+    outcome = env.step(start.set("action", torch.zeros(env.action_spec.shape, device=env.device)))["next"]
     assert outcome["terminated"].flatten().tolist() == [index == 2 for index in range(8)]
     assert outcome["reward"][2] == 0
     assert torch.equal(outcome["observation"][2], before[2])
@@ -77,7 +86,7 @@ def test_a_diverging_simulation_ends_its_own_episode_only(env):
 def test_a_partial_reset_leaves_the_neighbours_alone(env, actions):
     _, carrier = play(env, env.reset(), actions(env, 3))
     before, outputs = env.get_state(), copied(env.simulation)
-    mask = torch.zeros(8, 1, dtype=torch.bool)
+    mask = torch.zeros(8, 1, dtype=torch.bool, device=env.device)
     mask[3] = True
     env.reset(carrier.set("_reset", mask))
     others = [0, 1, 2, 4, 5, 6, 7]
@@ -86,8 +95,8 @@ def test_a_partial_reset_leaves_the_neighbours_alone(env, actions):
     assert env.simulation.state["time"][3] == 0
 
 
+@exact
 def test_a_restored_environment_continues_bit_for_bit(make, actions):
-    """On the CPU; on a GPU threads add up in any order."""
     env = make("heading", physics="warp", max_episode_steps=15)
     script = actions(env, 40)
     _, carrier = play(env, env.reset(), script[:20])
@@ -102,6 +111,7 @@ def test_a_restored_environment_continues_bit_for_bit(make, actions):
     assert torch.equal(onward["next", "reward"], again["next", "reward"])
 
 
+@exact
 def test_the_same_seed_gives_the_same_trajectory_and_simulations_draw_their_own(make, actions):
     runs = []
     for seed in (3, 3, 4):
@@ -118,22 +128,23 @@ def test_a_graph_does_what_its_launches_do(make, actions):
     for action in actions(recorded, 3):
         for env in (recorded, plain):
             env.simulation.step(action)
-    rows_equal(copied(recorded.simulation), copied(plain.simulation), slice(None))
+    rows_agree(copied(recorded.simulation), copied(plain.simulation), slice(None))
 
 
 def test_too_little_room_for_constraints_is_a_fault_and_for_contacts_an_error(make):
-    model, device = make("heading").simulation.model, torch.device("cpu")
+    warp = make("heading", physics="warp")
+    model, device = warp.simulation.model, warp.device
     few = WarpSimulation(model, 2, device=device, substeps=1, contacts=24, constraints=4)
     sunk = few.state["qpos"].clone()
     sunk[1, 2] -= 0.005  # both feet in the ground: 8 contacts of 4 constraints each
     sunk[0, 2] += 1.0
-    few.reset(torch.arange(2), {"qpos": sunk})
-    assert few.step(torch.zeros(2, model.nu)).tolist() == [1]
+    few.reset(torch.arange(2, device=device), {"qpos": sunk})
+    assert few.step(torch.zeros(2, model.nu, device=device)).tolist() == [1]
     assert few.state["time"].tolist() == pytest.approx([model.opt.timestep, 0.0])
     crowded = WarpSimulation(model, 2, device=device, substeps=1, contacts=1, constraints=4)
-    crowded.reset(torch.arange(2), {"qpos": sunk})
+    crowded.reset(torch.arange(2, device=device), {"qpos": sunk})
     with pytest.raises(RuntimeError, match="more contacts than the 2 that there is room for"):
-        crowded.step(torch.zeros(2, model.nu))
+        crowded.step(torch.zeros(2, model.nu, device=device))
 
 
 def test_room_grows_with_what_can_touch_the_ground(make):
@@ -146,13 +157,15 @@ def test_a_simulation_is_given_to_mujoco_to_draw_it(env, actions):
     play(env, env.reset(), actions(env, 3))
     data = env.simulation.data(2)
     torch.testing.assert_close(
-        torch.from_numpy(data.xpos).float(), env.simulation.outputs["xpos"][2], atol=1e-5, rtol=0
+        torch.from_numpy(data.xpos).float(), env.simulation.outputs["xpos"][2].cpu(), atol=1e-5, rtol=0
     )
     assert env.arrows(2)[0][0].shape == (3,)
 
 
 def test_a_state_that_is_not_finite_is_refused(env):
     env.reset()
-    state = TensorDict({"qpos": env.simulation.state["qpos"].clone(), "qvel": torch.full((8, 23), torch.nan)}, [8])
+    state = TensorDict({"qpos": env.simulation.state["qpos"].cpu(), "qvel": torch.full((8, 23), torch.nan)}, [8]).to(
+        env.device
+    )
     with pytest.raises(ValueError, match="qvel is not finite"):
         env.reset(state, set_state=True)
