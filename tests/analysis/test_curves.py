@@ -128,6 +128,12 @@ def test_each_curve_is_one_line_of_its_own_colour_that_the_legend_names(tmp_path
         np.testing.assert_allclose(line.get_ydata(), 0.5)
 
 
+def test_no_curve_is_left_out_however_many_there_are(tmp_path):
+    run = constant_run(tmp_path / "run", 0.5)
+    figure = draw_curves(learning_curves({str(number): [run] for number in range(30)}, num_bins=4))
+    assert len(figure.axes[0].lines) == len(figure.legends[0].get_texts()) == 30
+
+
 def test_a_curve_of_a_single_point_is_seen(tmp_path):
     runs = [constant_run(tmp_path / f"{number} rows", 0.5, num_rows=number) for number in (1, 10)]
     single, line = learning_curves({run.name: [run] for run in runs}, num_bins=10)

@@ -88,3 +88,12 @@ def test_silhouettes_are_those_of_points_on_a_line():
 
 def test_silhouettes_of_primitives_that_act_alike_are_about_zero():
     assert np.abs(silhouettes(RANDOM.normal(size=(200, 4, 2)))).max() < 0.1
+
+
+def test_what_has_no_spread_has_numbers():
+    assert silhouettes(np.random.default_rng(0).normal(size=(10, 1, 3))).tolist() == [0.0]
+    assert between_primitives(np.ones((5, 3, 2))) == 0.0
+    scores, shares = principal_components(np.arange(4.0)[:, None])
+    assert np.abs(scores[:, 0]).tolist() == [1.5, 0.5, 0.5, 1.5]
+    assert not scores[:, 1].any()
+    assert shares.tolist() == [1.0, 0.0]

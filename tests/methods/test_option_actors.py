@@ -133,6 +133,17 @@ def test_deterministic_choices_and_actions_repeat_themselves():
         assert torch.equal(one["action"], one["loc"])
 
 
+@pytest.mark.parametrize("make", [hierarchical, option_critic])
+def test_options_have_no_mean_but_a_likeliest_one(make):
+    _, actor = make()
+    with set_exploration_type(ExplorationType.MEAN), pytest.raises(ValueError, match="options have no mean"):
+        actor.policy(situations())
+    with torch.no_grad(), set_exploration_type(ExplorationType.MODE):
+        mode = actor.policy(situations())
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(actor.policy(situations())["option"], mode["option"])
+
+
 def test_terminations_are_judged_where_the_option_led_and_not_where_it_acted():
     _, actor = option_critic()
     sample = situations()

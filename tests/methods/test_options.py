@@ -100,3 +100,14 @@ def test_diagnostics_tell_who_acts_and_for_how_long():
     collapsed = option_diagnostics(torch.full((5,), 2), torch.ones(5).bool(), num_options=4)
     assert collapsed["effective_options"].item() == 1.0
     assert collapsed["duration"].item() == 1.0
+
+
+def test_an_empty_batch_has_empty_outputs():
+    loc, scale = SeparateOptions(S, A, K, policy=POLICY)(torch.zeros(0, S), torch.zeros(0, dtype=torch.int64))
+    assert loc.shape == scale.shape == (0, A)
+
+
+@pytest.mark.parametrize("epsilon", [-0.1, 1.1, float("nan")])
+def test_a_random_choice_needs_a_probability(epsilon):
+    with pytest.raises(ValueError, match=f"epsilon={epsilon} is no probability"):
+        EpsilonGreedy(torch.zeros(K), epsilon)

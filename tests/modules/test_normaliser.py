@@ -109,3 +109,12 @@ def test_statistics_have_the_precision_of_the_buffers_whatever_the_samples_have(
     normaliser.update(x)
     variance, mean = torch.var_mean(x.double(), dim=0, correction=0)
     torch.testing.assert_close((normaliser.mean, normaliser.variance), (mean.float(), variance.float()))
+
+
+@pytest.mark.parametrize("width", [1, 5])
+def test_another_number_of_features_is_refused_instead_of_broadcast(width):
+    normaliser = RunningNormaliser(4)
+    for use in (normaliser, normaliser.update):
+        with pytest.raises(ValueError, match=f"x is \\(2, {width}\\): its last dimension must have 4 features"):
+            use(torch.ones(2, width))
+    assert not normaliser.mean.any()

@@ -147,6 +147,18 @@ def test_frozen_terminations_leave_the_options_to_learn():
         assert torch.equal(value, expected[key]), key
 
 
+def test_samples_may_be_passed_by_keys():
+    samples, acting = exact_samples(Problem(), Options(), 0), Options()
+    logits = TensorDictModule(lambda s, k: acting.policies[k, s], ["observation", "option"], ["logits"])
+    actor = ProbabilisticTensorDictSequential(logits, tabular_loss(acting).actor_network[-1])
+    critic = TensorDictModule(nn.Embedding(STATES, 1).double(), ["observation"], ["state_value"])
+    loss = OptionCriticLoss(actor, critic, **SETTINGS)
+    loss.in_keys = ["observation", "option", "action", "action_log_prob", "advantage", "value_target"]
+    found = loss(**{key: samples[key] for key in loss.in_keys})
+    for value, key in zip(found, loss.out_keys, strict=True):
+        assert torch.equal(value, loss(samples)[key]), key
+
+
 GOES_ON, TERMINATED, TRUNCATED = range(3)
 
 

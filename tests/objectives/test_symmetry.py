@@ -66,6 +66,16 @@ def test_half_of_the_samples_are_mirror_images_to_learn_from_like_the_others(ove
         torch.testing.assert_close(after[key], acted[key], atol=1e-5, rtol=1e-4)
 
 
+def test_a_batch_may_have_no_image(tmp_path):
+    agent, trainer = trainer_of(tmp_path, "symmetry=augment", "method=scratch", "task=heading")
+    single = collect(agent, trainer)[:1, :1]
+    replaced = 0
+    for _ in range(20):
+        after = trainer.advantages(single.clone())
+        replaced += not torch.equal(after["action"], single["action"])
+    assert 0 < replaced < 20
+
+
 def test_a_sample_whose_image_the_policy_finds_all_but_impossible_is_not_replaced(tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=augment", "method=scratch", "task=heading")
     before = collect(agent, trainer)

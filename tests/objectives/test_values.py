@@ -57,3 +57,13 @@ def test_of_options_only_the_value_of_the_one_that_acted_is_judged():
     loss.backward()
     # The errors 3 - 2 and 4 - 7, halved by the mean, where the options acted.
     torch.testing.assert_close(values.weight.grad, torch.tensor([[0.0, 0.0, 0.5], [-1.5, 0.0, 0.0]]))
+
+
+@pytest.mark.parametrize("loss", [ValueLoss, OptionValueLoss])
+def test_targets_of_another_shape_than_values_are_refused_instead_of_broadcast(loss):
+    keys = (["observation"], ["state_value" if loss is ValueLoss else "option_values"])
+    critic = TensorDictSequential(TensorDictModule(nn.Linear(3, 1), *keys))
+    data = samples(option=torch.zeros(64, dtype=torch.int64))
+    loss(critic, coeff=1.0)(data)
+    with pytest.raises(ValueError, match=r"value_target is \(64,\), and values are \(64, 1\)"):
+        loss(critic, coeff=1.0)(data.set("value_target", data["value_target"].squeeze(-1)))

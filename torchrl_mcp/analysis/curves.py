@@ -4,7 +4,7 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +117,7 @@ def plot_curves(
         ylabel: Label of the quantity.
     """
     # When colours repeat, dashes distinguish lines.
-    lines = product(("-", "--", ":"), COLOURS)
+    lines = cycle(product(("-", "--", ":"), COLOURS))
     styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
         axes.fill_between(curve.frames, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0)

@@ -83,13 +83,17 @@ def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
 def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
     """Return the principal components of actions, ``(M, num)``, and their shares of the variance.
 
+    Components beyond the number of actions are 0.
+
     Args:
         actions: Actions, shape ``(M, A)``.
         num: Number of components.
     """
     centred = actions - actions.mean(0)
     _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
-    return centred @ directions[:num].T, np.square(sizes[:num]) / np.square(sizes).sum()
+    scores, shares = centred @ directions[:num].T, _ratio(np.square(sizes[:num]), np.square(sizes).sum())
+    missing = num - len(shares)
+    return np.pad(scores, ((0, 0), (0, missing))), np.pad(shares, (0, missing))
 
 
 def between_primitives(actions: Array) -> float:
@@ -99,7 +103,7 @@ def between_primitives(actions: Array) -> float:
         actions: Mean action of every primitive in the same states, shape ``(M, K, A)``.
     """
     deviation = actions - actions.mean((0, 1))
-    return float(np.square(deviation.mean(0)).sum() * len(actions) / np.square(deviation).sum())
+    return float(_ratio(np.square(deviation.mean(0)).sum() * len(actions), np.square(deviation).sum()))
 
 
 def silhouettes(actions: Array) -> Array:
@@ -108,7 +112,8 @@ def silhouettes(actions: Array) -> Array:
     .. math:: s = \frac{b - a}{\max(a, b)}
 
     with a the mean distance of an action from the other actions of its primitive, and b its mean distance from the
-    actions of the nearest other primitive. 1 is well separated, 0 on the border, negative among other actions.
+    actions of the nearest other primitive. 1 is well separated, 0 on the border, negative among other actions. A single
+    primitive has 0.
 
     Args:
         actions: Mean action of every primitive in the same states, shape ``(M, K, A)``, M at least 2.
@@ -117,6 +122,8 @@ def silhouettes(actions: Array) -> Array:
         Rousseeuw, Silhouettes, 1987, https://doi.org/10.1016/0377-0427(87)90125-7
     """
     num_states, num_primitives, _ = actions.shape
+    if num_primitives == 1:
+        return np.zeros(1)
     points = actions.swapaxes(0, 1).reshape(num_states * num_primitives, -1)
     squares = np.square(points).sum(-1)
     distances = np.sqrt((squares[:, None] + squares - 2 * points @ points.T).clip(min=0.0))

@@ -5,11 +5,10 @@ from collections.abc import Callable, Collection
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
 from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.methods.options import OptionActor, RandomSequence, WhereBeginning, keep_option
+from torchrl_mcp.methods.options import Choice, OptionActor, RandomSequence, WhereBeginning, keep_option
 
 
 def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: int) -> nn.ModuleDict:
@@ -81,7 +80,7 @@ def gated_actor(
     if steps_per_choice < 1:
         raise ValueError(f"steps_per_choice must be at least 1, got {steps_per_choice}")
     gate = WhereBeginning(parts["gating"], num_options)
-    choice = sampler("option", Categorical, logits="gate_logits")
+    choice = sampler("option", Choice, logits="gate_logits")
     trained = ProbabilisticTensorDictSequential(
         normalise_inputs(parts),
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_logits"]),

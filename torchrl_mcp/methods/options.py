@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NoReturn, Self
 
 import torch
 from torch import Size, Tensor, nn
@@ -48,7 +48,8 @@ class SeparateOptions(nn.Module):
         states = observation.reshape(-1, observation.shape[-1])[order].split(counts)
         outputs = [policy(state, state[:, :0]) for policy, state in zip(self.policies, states, strict=True)]
         back = order.argsort()
-        loc, scale = (torch.cat(output)[back].reshape(*option.shape, -1) for output in zip(*outputs, strict=True))
+        merged = (torch.cat(output)[back] for output in zip(*outputs, strict=True))
+        loc, scale = (output.reshape(*option.shape, output.shape[-1]) for output in merged)
         return loc, scale
 
 
@@ -141,7 +142,25 @@ class RandomSequence:
         return self._options(state, self._option)[0]
 
 
-class EpsilonGreedy(Categorical):
+class Choice(Categorical):
+    """A distribution over options. Numbers of options have no mean."""
+
+    @property
+    def mean(self) -> NoReturn:
+        """Raise an error.
+
+        Raises:
+            ValueError: Always; TorchRL would replace a ``NotImplementedError`` by a mean of samples.
+        """
+        raise ValueError("options have no mean: use ExplorationType.DETERMINISTIC, the likeliest option, or RANDOM")
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The likeliest option, ``(*B)``."""
+        return self.mode
+
+
+class EpsilonGreedy(Choice):
     r"""The policy over options: the option of highest value, or with probability :math:`\epsilon` a random option.
 
     .. math:: \pi_\Omega(\omega|s, g) = (1 - \epsilon) [\omega = \arg\max Q_\Omega(s, g, \cdot)] + \epsilon / K
@@ -150,12 +169,17 @@ class EpsilonGreedy(Categorical):
         values: Values of the options, shape ``(*B, K)``.
         epsilon: Probability :math:`\epsilon` of a random choice.
 
+    Raises:
+        ValueError: If ``epsilon`` is no probability.
+
     Example:
         >>> EpsilonGreedy(torch.tensor([0.0, 2.0, 1.0, 0.0]), epsilon=0.2).probs
         tensor([0.0500, 0.8500, 0.0500, 0.0500])
     """
 
     def __init__(self, values: Tensor, epsilon: float) -> None:
+        if not 0 <= epsilon <= 1:
+            raise ValueError(f"epsilon={epsilon} is no probability: pass a number from 0 to 1")
         self._best = values.argmax(-1)
         best = nn.functional.one_hot(self._best, values.shape[-1])
         super().__init__(probs=(1 - epsilon) * best + epsilon / values.shape[-1])

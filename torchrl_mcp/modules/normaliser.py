@@ -55,7 +55,12 @@ class RunningNormaliser(nn.Module):
         self.count.data = self.count.expand_as(self.mean).clone()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise ``x``, shape ``(*B, F)``."""
+        """Normalise ``x``, shape ``(*B, F)``.
+
+        Raises:
+            ValueError: If ``x`` has another number of features.
+        """
+        self._require_features(x)
         return ((x - self.mean) * (self.variance + self.epsilon).rsqrt()).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
@@ -65,9 +70,13 @@ class RunningNormaliser(nn.Module):
         Samples with a feature that is not finite or beyond ``LARGEST`` are left out with a warning, because a single
         one would outweigh all earlier samples.
 
+        Raises:
+            ValueError: If ``x`` has another number of features.
+
         Reference:
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
         """
+        self._require_features(x)
         x = x.reshape(-1, x.shape[-1]).to(self.mean.dtype)
         good = x.abs() <= LARGEST
         if not (within := good.all(-1)).all():
@@ -86,6 +95,10 @@ class RunningNormaliser(nn.Module):
         self.variance.copy_(self.variance + share * (variance - self.variance + (1 - share) * delta.square()))
         self.mean.add_(share * delta)
         self.count.add_(x.shape[0])
+
+    def _require_features(self, x: Tensor) -> None:
+        if x.shape[-1:] != self.mean.shape:  # one feature would be broadcast
+            raise ValueError(f"x is {tuple(x.shape)}: its last dimension must have {len(self.mean)} features")
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Take statistics with one count, or with one of each feature."""

@@ -9,6 +9,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictParams,
     TensorDictSequential,
+    dispatch,
 )
 from torch import Tensor
 from torch.distributions import Distribution
@@ -145,6 +146,7 @@ class OptionCriticLoss(BoundedClipPPOLoss):
         if "termination" in self.actor_network.out_keys:
             self.out_keys = [*self.out_keys, "loss_termination"]
 
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add ``loss_termination`` to the terms of the bounded loss."""
         out = super().forward(tensordict)

@@ -46,6 +46,8 @@ class MirroredSamples:
         """Return the samples of trajectories ``(N, T)``, half of them mirrored, with the estimates of advantages."""
         samples = self.advantages(batch)
         chosen = torch.rand(samples.shape, device=samples.device) < 0.5
+        if not chosen.any():
+            return samples
         image = samples[chosen]
         for key, mirror in self.mirrors.items():
             image[key] = mirror(image[key])

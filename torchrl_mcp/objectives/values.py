@@ -24,9 +24,16 @@ class ValueLoss(nn.Module):
         self.critic_network, self.coeff = critic_network, coeff
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_critic`` of samples ``(B,)``, and the ``explained_variance`` of the targets as a share."""
-        target = tensordict["value_target"]
-        residual = target - self._values(tensordict)
+        """Return ``loss_critic`` of samples ``(B,)``, and the ``explained_variance`` of the targets as a share.
+
+        Raises:
+            ValueError: If ``value_target`` has another shape than the values, ``(B, 1)``.
+        """
+        target, values = tensordict["value_target"], self._values(tensordict)
+        if target.shape != values.shape:
+            shapes = f"{tuple(target.shape)}, and values are {tuple(values.shape)}"
+            raise ValueError(f"value_target is {shapes}: give both one shape, such as with unsqueeze(-1)")
+        residual = target - values
         with torch.no_grad():
             explained = 1 - residual.var(correction=0) / target.var(correction=0).clamp_min(1e-8)
         return TensorDict({"loss_critic": self.coeff * residual.square().mean(), "explained_variance": explained})
