@@ -1,7 +1,7 @@
 """Environment steps per second: ours beside bare MuJoCo, Gymnasium, EnvPool and TorchRL's own environments.
 
     python benchmarks/throughput.py            # about five minutes, writes results/throughput_env.csv
-    python benchmarks/throughput.py --quick    # about one
+    python benchmarks/throughput.py --quick    # about one, writes nothing unless given --output
 
 Every contender simulates Ant-v5 (5 physics steps per action, without contact observations and costs unless stated),
 acts at random and resets fallen ants. Each has its own process. In a turn they are measured one after the other, round
@@ -232,7 +232,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="sizes 64 and 256, fewer rounds")
     parser.add_argument("--envpool-python", default=sys.executable, help="interpreter that has EnvPool")
-    parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--worker", nargs=2, metavar=("NAME", "NUM_ENVS"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -250,7 +250,8 @@ def main() -> None:
         print(table([line(row, {}) for row in new]), flush=True)
         rows += new
     print("\n".join(aims(rows)))
-    write(args.output, [line(row, facts) for row in rows])
+    if output := args.output or (None if args.quick else RESULTS):
+        write(output, [line(row, facts) for row in rows])
 
 
 if __name__ == "__main__":

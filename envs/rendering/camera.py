@@ -91,6 +91,7 @@ class Camera:
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
+        ValueError: If OpenGL cannot draw pictures of that size.
     """
 
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1) -> None:
@@ -98,7 +99,11 @@ class Camera:
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
         self._opengl = new_context(width, height)
         self._opengl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        except mujoco.FatalError as error:
+            self._opengl.free()
+            raise ValueError(f"OpenGL cannot draw width={width}, height={height}: pass less ({error})") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._model, self._size = model, mujoco.MjrRect(0, 0, width, height)
         self.scene = mujoco.MjvScene(model, MAX_SHAPES)

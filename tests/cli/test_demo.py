@@ -208,6 +208,14 @@ def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, ove
     assert not (tmp_path / "demo").exists()
 
 
+@pytest.mark.parametrize("override", ["character=biped", "+pretrained=mine", "method=moe"])
+def test_what_the_demonstration_sets_itself_cannot_be_set(tmp_path, monkeypatch, override):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-demo", "--output", str(tmp_path / "demo"), override])
+    with pytest.raises(SystemExit, match=re.escape(f"use torchrl-mcp-train to set {override}")):
+        command.main()
+    assert not (tmp_path / "demo").exists()
+
+
 def test_where_nothing_can_be_drawn_the_demonstration_says_so_and_ends_well(finished, monkeypatch, capsys):
     def refuse(*arguments, **settings):
         raise RuntimeError("no OpenGL")

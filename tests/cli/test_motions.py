@@ -125,6 +125,16 @@ def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     assert lines[6] == "written to clips"
 
 
+def test_a_mirror_image_replaces_no_other_clip(run, tmp_path):
+    for name, length in (("walk", 1.0), ("walk_mirrored", 2.0)):
+        (tmp_path / f"{name}.txt").write_text(motion(length))
+    status, output, errors = run("import", "walk.txt", "walk_mirrored.txt", "--mirror", "--output", "clips")
+    assert (status, output) == (2, "")
+    assert "a file and a mirror image are both called walk_mirrored: leave the file out, or --mirror" in errors
+    assert not (tmp_path / "clips").exists()
+    assert run("import", "walk.txt", "walk_mirrored.txt", "--output", "clips")[0] == 0
+
+
 def test_clips_and_recordings_can_be_inspected(run, tmp_path):
     (tmp_path / "walk.txt").write_text(motion(1.0, "wrap"))
     run("import", "walk.txt", "--character", "biped")
@@ -315,6 +325,12 @@ WRONG = {
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
     "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' is no duration: pass more than 0 seconds"),
+    "endless": (["render", "stand.txt", "--seconds", "inf"], "'inf' is no duration"),
+    "no frames": (["inspect", "stand.txt", "--skip", "-3"], "--skip: '-3' is no whole number of at least 0"),
+    "no Python": (
+        ["inspect", "stand.txt", "--module", "broken_code"],
+        r"broken_code, which is no Python: .*broken_code\.py, line 1",
+    ),
     "same name": (["inspect", "stand.txt", "more/stand.txt"], "two files are called stand"),
     "missing folder": (["build-paper-corpus", "nowhere"], "nowhere lacks"),
 }
@@ -325,6 +341,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     (tmp_path / "cut.bvh").write_text("nothing")
     (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04nothing")
     (tmp_path / "notes.md").write_text("nothing")
+    (tmp_path / "broken_code.py").write_text("import (")
     (tmp_path / "bodies.yaml").write_text("chest: chest")
     (tmp_path / "stand.csv").write_text("0,0,1,1,0,0,0\n" * 2)
     (tmp_path / "more").mkdir()

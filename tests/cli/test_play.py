@@ -35,6 +35,19 @@ def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_fo
         assert gif.n_frames == 3
 
 
+@pytest.mark.parametrize("seconds", ["inf", "nan", "-1", "0"])
+def test_a_film_has_an_end(monkeypatch, capsys, seconds):
+    with pytest.raises(SystemExit):
+        call(monkeypatch, "builtin:biped", "--seconds", seconds)
+    assert f"{seconds!r} is no duration: pass more than 0 seconds" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(opengl._platform() is None, reason="no OpenGL to draw with")
+def test_a_film_that_is_too_large_to_draw_is_refused(monkeypatch, tmp_path):
+    said = refused(monkeypatch, "builtin:biped", "--output", tmp_path / "film.gif", "--width", 100_000)
+    assert "OpenGL cannot draw width=100000, height=360: pass less" in said
+
+
 def test_unknown_networks_are_refused_by_those_that_there_are(monkeypatch):
     said = refused(monkeypatch, "builtin:horse")
     assert "no builtin:horse comes with the library" in said

@@ -179,9 +179,12 @@ def test_no_file_is_overwritten(run, taken, tmp_path):
 def test_the_card_compares_neither_a_range_of_speeds_nor_a_variant_with_the_paper(tmp_path, settings, said):
     values = {"normalised_return": 0.5, "interval": (0.4, 0.6), "terminated": 0.0, "metrics": {}}
     numbers = {"episodes": 2, "seed": 0, "deterministic": values, "stochastic": values}
-    (tmp_path / "gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
+    (tmp_path / "my gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
     cfg = compose_run("task=heading", "character=humanoid", "stage=transfer", f"run_dir={tmp_path}", *settings)
-    assert said in publishing.model_card(tmp_path / "gate.torchrl", cfg, numbers, origin={}, steps=1, limits=[])
+    facts = {"origin": {}, "steps": 1, "limits": [], "trust": ["--trust", "own"]}
+    card = publishing.model_card(tmp_path / "my gate.torchrl", cfg, numbers, **facts)
+    assert said in card
+    assert "`torchrl-mcp-play --trust own 'my gate.torchrl' --viewer web`" in card
 
 
 def test_a_gate_over_a_pre_training_leaves_out_what_its_published_file_holds(monkeypatch, tmp_path):

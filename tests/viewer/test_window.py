@@ -1,5 +1,6 @@
 import contextlib
 import math
+import sys
 
 import mujoco
 import mujoco.viewer
@@ -11,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_mcp.envs import Dribble, Heading
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.steering import Steering
-from torchrl_mcp.viewer.window import LENGTH, Keyboard, apply_mouse, as_text, play_in_window
+from torchrl_mcp.viewer.window import LENGTH, Keyboard, apply_mouse, as_text, play_in_window, require_display
 
 GATED = TensorDictModule(
     lambda goal: (torch.zeros(len(goal), 17), torch.tensor([[1.0, 0.5]])),
@@ -49,6 +50,7 @@ class Window:
 def opened(monkeypatch):
     """Plays in a window for a while."""
     monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("glfw.init", lambda: True)
 
     def play(window, player):
         monkeypatch.setattr(mujoco.viewer, "launch_passive", window.open)
@@ -115,3 +117,11 @@ def test_weights_are_strokes_beside_the_numbers_of_their_primitives():
     numbers, strokes = as_text(Weights("gates", [0.0, 0.5, 1.0]))
     assert numbers.split("\n") == ["gates", "1", "2", "3"]
     assert [len(line) for line in strokes.split("\n")] == [0, 0, LENGTH / 2, LENGTH]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="DISPLAY is Linux's")
+def test_a_display_that_does_not_open_is_named_with_what_works_without(monkeypatch):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    with pytest.raises(RuntimeError, match=r"none opens \(DISPLAY=:987\): watch in a browser with --viewer web"):
+        require_display()

@@ -1,9 +1,12 @@
 """``torchrl-mcp-character``: check whether an MJCF file is a character, or convert a body into a character."""
 
 import argparse
+import keyword
 import re
 import sys
 from pathlib import Path
+
+import yaml  # type: ignore[import-untyped]
 
 from torchrl_mcp.cli.parsing import explained, new_parser
 from torchrl_mcp.commands import announce
@@ -91,6 +94,8 @@ def _value(text: str) -> tuple[str, float]:
 def _name(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
         raise argparse.ArgumentTypeError(f"{text!r} names a Python module, too: use small letters, digits and _")
+    if keyword.iskeyword(text) or yaml.safe_load(text) != text:
+        raise argparse.ArgumentTypeError(f"{text!r} is a word of Python or YAML: choose another name")
     return text
 
 

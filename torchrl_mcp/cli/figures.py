@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser, seed
+from torchrl_mcp.cli.parsing import add_trust, count, explained, new_parser, seconds, seed
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs.builtin import PREFIX, locate
 
@@ -53,12 +53,12 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(draw="holdout")
     command = commands.add_parser("exploration", parents=[shared], help="Figure 6: paths of random exploration")
     command.add_argument("--trajectories", type=count, default=48, metavar="N", help="how many (default %(default)s)")
-    command.add_argument("--seconds", type=float, default=10.0, help="length of each (default %(default)s)")
+    command.add_argument("--seconds", type=seconds, default=10.0, help="length of each (default %(default)s)")
     command.set_defaults(draw="explore")
     command = commands.add_parser("primitives", parents=[shared], help="Figure 7: weights over the walk cycle, actions")
     command.add_argument("--clip", help="generated motion to follow, such as left_sharp (default straight ahead)")
     command.add_argument("--walkers", type=count, default=8, metavar="N", help="how many (default %(default)s)")
-    command.add_argument("--seconds", type=float, default=10.0, help="length of each walk (default %(default)s)")
+    command.add_argument("--seconds", type=seconds, default=10.0, help="length of each walk (default %(default)s)")
     command.set_defaults(draw="analyse")
     return parser
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torchrl_mcp.cli.parsing import explained, new_parser, own_module
+from torchrl_mcp.cli.parsing import explained, index, new_parser, own_module, seconds
 
 PROGRAM = "torchrl-mcp-motions"
 
@@ -38,6 +38,8 @@ def main() -> None:
             import_own(arguments.module, "--module names")
         getattr(motions, arguments.run)(arguments)
     except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
+        if sys.flags.dev_mode:
+            raise
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         sys.exit(2)
 
@@ -72,10 +74,10 @@ def parser() -> argparse.ArgumentParser:
         "--map", action="append", default=[], metavar="PART=JOINT", help="joint of a part of the body; repeatable"
     )
     source.add_argument(
-        "--skip", type=int, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
+        "--skip", type=index, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
     )
     source.add_argument(
-        "--rest-frame", type=int, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
+        "--rest-frame", type=index, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
     )
     source.add_argument("--up", metavar="AXIS", help="axis of the files that points up: x, y, z; --up=-y for downwards")
     source.add_argument(
@@ -98,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")
     command.add_argument(
-        "--seconds", type=_seconds, default=10.0, help="maximum length of the film (default %(default)s)"
+        "--seconds", type=seconds, default=10.0, help="maximum length of the film (default %(default)s)"
     )
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="render_files")
@@ -107,16 +109,6 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--output", type=Path, default=Path("corpus"), help="folder (default %(default)s)")
     command.set_defaults(run="build_paper_corpus")
     return parser
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not seconds > 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no duration: pass more than 0 seconds")
-    return seconds
 
 
 if __name__ == "__main__":

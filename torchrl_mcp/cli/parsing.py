@@ -1,6 +1,7 @@
 """Parsing that all commands share. It imports neither torch nor MuJoCo nor Hydra, which take seconds."""
 
 import argparse
+import math
 import os
 import sys
 import textwrap
@@ -72,6 +73,22 @@ def own_module(name: str) -> str:
 def count(text: str) -> int:
     """Return a number of at least 1."""
     return _whole(text, 1, None)
+
+
+def index(text: str) -> int:
+    """Return a number of at least 0."""
+    return _whole(text, 0, None)
+
+
+def seconds(text: str) -> float:
+    """Return a duration."""
+    try:
+        duration = float(text)
+    except ValueError:
+        duration = 0.0
+    if not 0 < duration < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no duration: pass more than 0 seconds")
+    return duration
 
 
 def seed(text: str) -> int:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, explained, find_own_modules, new_parser, port, seed
+from torchrl_mcp.cli.parsing import add_task, add_trust, explained, find_own_modules, new_parser, port, seconds, seed
 from torchrl_mcp.commands import announce
 from torchrl_mcp.evaluation.formats import require_format
 from torchrl_mcp.runs.builtin import locate
@@ -42,6 +42,8 @@ def main() -> None:
         with trusting(arguments.trust):
             play(arguments)
     except RuntimeError as error:
+        if sys.flags.dev_mode:
+            raise
         sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit()
@@ -88,7 +90,7 @@ def parser() -> argparse.ArgumentParser:
     )
     film = parser.add_argument_group("film")
     film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default %(default)s)")
-    film.add_argument("--seconds", type=float, default=10.0, help="length of the film (default %(default)s)")
+    film.add_argument("--seconds", type=seconds, default=10.0, help="length of the film (default %(default)s)")
     film.add_argument("--width", type=int, default=480, help="width in pixels (default %(default)s)")
     film.add_argument("--height", type=int, default=360, help="height in pixels (default %(default)s)")
     viewer = parser.add_argument_group("viewer")

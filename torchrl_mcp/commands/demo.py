@@ -40,6 +40,9 @@ TITLES = {"pretrain": "primitives", "mcp": "MCP", "scratch": "scratch"}
 BUILTIN_STEPS = 10_649_600
 """Environment steps of imitation of the humanoid's primitives that come with the library."""
 
+OWN = ("character", "method", "pretrained", "run_dir", "stage", "task")
+"""Settings that the demonstration makes itself."""
+
 RECENT = 10
 """Iterations whose returns are averaged in the line of progress."""
 
@@ -92,8 +95,11 @@ def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: 
     """Return the configurations of the runs in ``folder``.
 
     Raises:
-        ValueError: If the folder holds a run with another configuration.
+        ValueError: If the demonstration makes a setting itself, or the folder holds a run with another configuration.
     """
+    for word in overrides:
+        if word.lstrip("+~").partition("=")[0] in OWN:
+            raise ValueError(f"the demonstration is of the humanoid's heading: use torchrl-mcp-train to set {word}")
     presets = dict.fromkeys(RUNS, f"preset={preset}") | {"pretrain": f"preset={preset}_pretrain"}
     runs = {
         name: configuration.compose_run(*words, presets[name], *overrides)

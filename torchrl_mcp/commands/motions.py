@@ -78,8 +78,10 @@ SLIDING = 0.2
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file as soon as it is read, and its mirror image if requested."""
     names = [path.stem for path in arguments.files]
-    names += [f"{name}{MIRRORED}" for name in names if arguments.mirror]
-    _require_no_recordings(names, arguments.output, arguments.files)
+    images = [f"{name}{MIRRORED}" for name in names if arguments.mirror]
+    if taken := set(names) & set(images):
+        raise ValueError(f"a file and a mirror image are both called {min(taken)}: leave the file out, or --mirror")
+    _require_no_recordings(names + images, arguments.output, arguments.files)
     written: dict[str, Import] = {}
     failed: Failures = {}
     for name, motion in _read(arguments, failed):

@@ -10,11 +10,12 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_mcp.report.comparison import reported
 from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.report.results import Run, leaves
-from torchrl_mcp.runs import policies, records
+from torchrl_mcp.runs import policies, quoting, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.identity import CONDUCT, is_among
+from torchrl_mcp.runs.trust import trust_options
 from torchrl_mcp.training import checkpoint, run_folder
-from torchrl_mcp.training.run_folder import MODES, PROVENANCE, read_json
+from torchrl_mcp.training.run_folder import CONFIG, MODES, PROVENANCE, read_json
 
 PLACES = ("run_dir=", "run_root=", "resume=")
 """Prefixes of arguments that only concern the machine of the run."""
@@ -40,8 +41,8 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
-    steps = run_folder.frames(checkpoint.find(run))
-    card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits), encoding="utf-8")
+    steps, trust = run_folder.frames(checkpoint.find(run)), trust_options(run / CONFIG)
+    card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits, trust=trust), encoding="utf-8")
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
 
 
@@ -53,6 +54,7 @@ def model_card(
     *,
     steps: int,
     limits: Sequence[str],
+    trust: Sequence[str] = (),
 ) -> str:
     """Return the model card of a published file, in Markdown.
 
@@ -63,16 +65,18 @@ def model_card(
         origin: Provenance of the run; missing entries are written as unknown.
         steps: Environment steps of training.
         limits: Sentences about the policy's limits.
+        trust: Options with which commands trust the policy's own modules.
     """
     name = path.stem.removeprefix("mcp-")
     checkpoint_name = f"{PREFIX}{name}" if path.parent.resolve() == FOLDER.resolve() else path.name
+    play = quoting.command("play", *trust, checkpoint_name, "--viewer", "web")
     returns = "\n".join(f"- {mode}: {_returns(numbers[mode])}" for mode in MODES)
     character = CHARACTERS.get(cfg.character.name, cfg.character.name)
     return f"""\
 # {name}
 
 {cfg.method.title} on `task={cfg.task.name}` with the {character if character == "T-Rex" else character.lower()}:
-`torchrl-mcp-play {checkpoint_name} --viewer web`.
+`{play}`.
 
 {_facts(path, cfg, origin, steps)}
 

@@ -220,10 +220,12 @@ def import_own(module: str, origin: str) -> None:
         origin: What names it, the beginning of an error.
 
     Raises:
-        ValueError: If there is no such module.
+        ValueError: If there is no such module, or it is no Python.
     """
     try:
         import_module(module)
+    except SyntaxError as error:
+        raise ValueError(f"{origin} {module}, which is no Python: {error}") from error
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
             raise

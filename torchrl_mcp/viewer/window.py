@@ -3,9 +3,11 @@
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
+import glfw  # type: ignore[import-untyped]
 import mujoco
 import mujoco.viewer
 import numpy as np
@@ -128,11 +130,24 @@ def require_display() -> None:
     Raises:
         RuntimeError: If there is no display.
     """
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise RuntimeError(
-            "a window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY names one: watch in a browser with "
-            "--viewer web, or make a film with --output film.gif"
-        )
+    names = {name: os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")}
+    if sys.platform == "linux" and not any(names.values()):
+        problem = "neither DISPLAY nor WAYLAND_DISPLAY names one"
+    elif not _opens():
+        problem = f"none opens ({', '.join(f'{name}={value}' for name, value in names.items() if value)})"
+    else:
+        return
+    raise RuntimeError(
+        f"a window needs a display, and {problem}: watch in a browser with --viewer web, or make a film with "
+        "--output film.gif"
+    )
+
+
+def _opens() -> bool:
+    with warnings.catch_warnings(action="ignore"):
+        opens = bool(glfw.init())
+    glfw.terminate()
+    return opens
 
 
 def as_text(weights: Weights) -> tuple[str, str]:
