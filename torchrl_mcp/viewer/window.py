@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
-import glfw  # type: ignore[import-untyped]
+import glfw
 import mujoco
 import mujoco.viewer
 import numpy as np
