@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 
 
 def interval(name: str, value: Sequence[float]) -> tuple[float, float]:
@@ -26,7 +27,7 @@ def not_negative(**values: float) -> None:
         ValueError: If one is not, with its name.
     """
     for name, value in values.items():
-        if not 0.0 <= value < math.inf:
+        if not (isinstance(value, Real) and 0.0 <= value < math.inf):
             raise ValueError(f"{name}={value} is out of range: pass a finite number of at least 0")
 
 
@@ -37,5 +38,5 @@ def positive(**values: float) -> None:
         ValueError: If one is not, with its name.
     """
     for name, value in values.items():
-        if not 0.0 < value < math.inf:
+        if not (isinstance(value, Real) and 0.0 < value < math.inf):
             raise ValueError(f"{name}={value} is out of range: pass a finite number above 0")

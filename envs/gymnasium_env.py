@@ -22,7 +22,8 @@ class GymnasiumEnv(gymnasium.Env):
     A copy, or what is unpickled, is a new simulation in the same state, with the same random numbers ahead.
 
     The observation is a dictionary of ``observation`` and ``goal``; ``info`` has the task's metrics, such as
-    ``success`` of carrying and dribbling.
+    ``success`` of carrying and dribbling. ``gymnasium.make(max_episode_steps=)`` can only shorten episodes; a longer
+    limit is the task's: ``GymnasiumEnv(Heading, character="biped", max_episode_steps=900)``.
 
     Args:
         task: The task's class.
@@ -74,8 +75,6 @@ class GymnasiumEnv(gymnasium.Env):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode, after seeding with ``seed`` if given."""
         super().reset(seed=seed)
-        if self.spec is not None and self.spec.max_episode_steps:  # an argument of gymnasium.make that it keeps
-            self.env.max_episode_steps = self.spec.max_episode_steps
         if seed is not None:
             self.env.set_seed(seed)
         outcome = self.env.reset()

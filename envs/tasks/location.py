@@ -134,6 +134,7 @@ class Location(PDCharacterEnv):
         """Draw another place where the time for the last one is over."""
         self.episode["seconds_left"] -= self.control_timestep
         over = self.episode["seconds_left"] < self.control_timestep / 2
+        over &= self.episode["elapsed_steps"].squeeze(-1) < self.max_episode_steps  # what the last step measures stays
         another = self._place(self.com[:, :2], self.heading())
         for name, value in {**another, "reached": torch.zeros_like(over)}.items():
             old = self.episode[name]

@@ -131,6 +131,16 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     torch.testing.assert_close(logits, gate_logits(gate.parts, scene["observation"], place))
 
 
+def test_an_entry_of_the_goal_needs_kept_networks_that_saw_it(tmp_path):
+    settings = ["width=0.5", "method=mcp", "task=carry", "stage=transfer", "pretrained=builtin:biped-location"]
+    cfg = configure(tmp_path, *settings, "waypoint=true", "transfer.goal_entry=waypoint")
+    said = (
+        "transfer.goal_entry=waypoint needs kept networks that saw it: add goal_normaliser or gating to transfer.keep"
+    )
+    with pytest.raises(ValueError, match=said):
+        experiment.train(cfg)
+
+
 @pytest.mark.parametrize(("task", "known"), [("carry", "has target.position, "), ("heading", "is one entry")])
 def test_an_entry_that_the_goal_lacks_is_refused(task, known, tmp_path):
     settings = ["method=mcp", f"task={task}", "character=biped", "stage=transfer", "pretrained=builtin"]

@@ -85,10 +85,10 @@ def test_the_info_tells_success():
     assert env.step(env.action_space.sample())[-1].keys() == {"success"}
 
 
-def test_the_time_limit_of_make_may_be_longer_than_the_tasks():
-    env = gymnasium.make("torchrl_mcp/Holdout-Ant-v0", max_episode_steps=205, terminate_when_unhealthy=False)
+def test_a_time_limit_longer_than_the_task_s_is_an_argument_of_the_task():
+    env = GymnasiumEnv(Heading, character="biped", max_episode_steps=605, terminate_on_fall=False)
     env.reset(seed=0)
-    truncated = [env.step(np.zeros(8))[3] for _ in range(205)]
+    truncated = [env.step(np.zeros(17))[3] for _ in range(605)]
     assert (sum(truncated), truncated[-1]) == (1, True)
 
 

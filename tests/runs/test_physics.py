@@ -94,7 +94,7 @@ def test_a_built_in_policy_earns_what_it_earns_on_mujocos_threads(character):
     ours, exact = returns["warp"], returns["mujoco"]
     interval = 1.96 * math.sqrt((ours.var() + exact.var()) / EPISODES)
     assert exact.mean() > 0.9
-    assert abs(ours.mean() - exact.mean()) < interval < 0.02
+    assert abs(ours.mean() - exact.mean()) < interval < 0.03  # a fall moves the mean by 0.01
 
 
 @pytest.mark.slow

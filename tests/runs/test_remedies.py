@@ -40,3 +40,29 @@ def test_heading_without_pretraining_names_the_networks_that_come_with_the_libra
 def test_networks_that_do_not_come_with_the_library_are_not_offered(tmp_path):
     with pytest.raises(ValueError, match=r"pretrained=<folder>$"):
         experiment.train(configure(tmp_path, *HEADING, "stage=transfer", "method=moe"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["task=heading", "+task.evaluation.max_turns=0.1"], "the task has no argument max_turns"),
+        (["task=carry", "task.evaluation.object_distances=[0,0.1]"], "object_distances"),
+        (
+            ["task=carry", "task.evaluation.speed=[0.5,1.0]"],
+            r"speed=\[0.5, 1.0\] is out of range: pass a finite number",
+        ),
+    ],
+    ids=str,
+)
+def test_what_the_evaluation_would_refuse_is_refused_before_training(tmp_path, settings, message):
+    cfg = configure(tmp_path, "method=scratch", "evaluation.episodes=2", *settings)
+    with pytest.raises(ValueError, match=message):
+        experiment.train(cfg)
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize(("name", "setting"), [("seed", "seed"), ("num_envs", "training.num_envs")])
+def test_arguments_of_environments_that_the_run_gives_are_refused_in_the_task(tmp_path, name, setting):
+    cfg = configure(tmp_path, "method=scratch", "task=heading", f"+task.transfer.{name}=3")
+    with pytest.raises(ValueError, match=f"task.transfer.{name} would not be read: give {setting} instead"):
+        experiment.train(cfg)

@@ -149,8 +149,17 @@ def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Charact
     entry = require_entry(env, name)
     narrow = instantiate(cfg.parts)(sizes._replace(goal=entry.stop - entry.start))
     load_kept(narrow, cfg.transfer.keep, pretrained, origin)
+    seeing = [part for part in narrow if _shapes(parts[part]) != _shapes(narrow[part])]
+    if not {*seeing} & {*cfg.transfer.keep}:
+        raise ValueError(
+            f"transfer.goal_entry={name} needs kept networks that saw it: add {' or '.join(seeing)} to transfer.keep"
+        )
     for kept in cfg.transfer.keep:
         widen_goal(parts[kept], narrow[kept], entry)
+
+
+def _shapes(module: nn.Module) -> dict[str, torch.Size]:
+    return {name: tensor.shape for name, tensor in module.state_dict().items()}
 
 
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:

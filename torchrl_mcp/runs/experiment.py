@@ -90,6 +90,8 @@ def _train(plan: Plan) -> Path:
     precision = choose(plan.cfg.autocast, plan.cfg.device)
     print(f"run folder: {plan.folder}{f', {precision}' if precision.autocast else ''}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(plan.cfg, {"autocast": precision.autocast}))
+    if cfg.evaluation.episodes:  # refuses now what the evaluation would refuse after training
+        build.make_env(cfg, num_envs=1, seed=cfg.evaluation.seed, **cfg.evaluation.environment).close()
     trainer = build.make_run(cfg, plan.folder, plan.initial)
     trainer.save()
     records.begin(plan.folder, trainer.config, precision)

@@ -4,6 +4,7 @@ A setting is written as its path in the configuration. A path includes all setti
 """
 
 import hashlib
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -89,11 +90,14 @@ def folder_name(overrides: str, pretrained: str | None) -> str:
 
     >>> folder_name("preset-smoke", None)
     'preset-smoke'
+    >>> folder_name("motions.path-../clips", None)
+    'motions.path-..-clips'
     """
     if pretrained is not None and pretrained != BUILTIN:
         path = Path(pretrained)
         mark = digest(path) if path.exists() else _hash(pretrained)
         overrides = "_".join(filter(None, (overrides, f"pretrained-{mark}")))
+    overrides = re.sub(r"[/\\]", "-", overrides)  # of paths
     if len(overrides.encode()) <= LONGEST:
         return overrides
     return f"{overrides.encode()[: LONGEST - 9].decode(errors='ignore')}-{_hash(overrides)}"
