@@ -130,13 +130,10 @@ def require_display() -> None:
     Raises:
         RuntimeError: If there is no display.
     """
-    names = {name: os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")}
-    if sys.platform == "linux" and not any(names.values()):
-        problem = "neither DISPLAY nor WAYLAND_DISPLAY names one"
-    elif not _opens():
-        problem = f"none opens ({', '.join(f'{name}={value}' for name, value in names.items() if value)})"
-    else:
+    names = [f"{name}={os.environ[name]}" for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
+    if sys.platform != "linux" or (names and _opens()):
         return
+    problem = f"none opens ({', '.join(names)})" if names else "neither DISPLAY nor WAYLAND_DISPLAY names one"
     raise RuntimeError(
         f"a window needs a display, and {problem}: watch in a browser with --viewer web, or make a film with "
         "--output film.gif"
