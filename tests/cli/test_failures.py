@@ -63,11 +63,24 @@ def test_a_run_that_cannot_go_on_says_why(cfg, monkeypatch, failure, sentence):
     assert sentence in said(cfg, monkeypatch, failure)
 
 
-def test_in_development_mode_the_command_ends_with_a_traceback():
-    words = [sys.executable, "-X", "dev", "-W", "ignore", "-m", "torchrl_mcp.cli.evaluate", "nowhere"]
-    plain = subprocess.run([*words[:1], *words[5:]], capture_output=True, text=True)
-    assert "Traceback" not in plain.stderr
-    assert "Traceback" in subprocess.run(words, capture_output=True, text=True).stderr
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "nowhere"],
+        ["motions", "inspect", "nowhere"],
+        ["play", "nowhere"],
+        ["train", "resume=nowhere"],
+        ["evaluate", "builtin:biped", "--task", "key=[1"],
+    ],
+    ids=" ".join,
+)
+def test_in_development_mode_a_command_ends_with_a_traceback(words, tmp_path):
+    def errors(*options):
+        command = [sys.executable, *options, "-m", f"torchrl_mcp.cli.{words[0]}", *words[1:]]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stderr
+
+    assert "Traceback" not in errors()
+    assert "Traceback" in errors("-X", "dev", "-W", "ignore")
 
 
 @pytest.mark.parametrize(

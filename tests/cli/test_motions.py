@@ -33,13 +33,13 @@ def run(monkeypatch, capsys, tmp_path):
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["torchrl-mcp-motions", *map(str, words)])
+        status, error = 0, ""
         try:
             motions.main()
-            status = 0
         except SystemExit as end:
-            status = end.code
+            status, error = (1, f"{end.code}\n") if isinstance(end.code, str) else (end.code, "")
         captured = capsys.readouterr()
-        return status, captured.out, captured.err
+        return status, captured.out, captured.err + error
 
     return run
 
@@ -80,14 +80,14 @@ def test_a_file_that_cannot_be_read_keeps_no_other_from_being_written(run, tmp_p
     (tmp_path / "cut.txt").write_text(motion(1.0)[:100])
     (tmp_path / "empty.bvh").write_text("")
     status, output, errors = run("import", "first.txt", "cut.txt", "empty.bvh", "last.txt", "--output", "clips")
-    assert status == 2
+    assert status == 1
     assert {path.name for path in (tmp_path / "clips").iterdir()} == {"first.npz", "last.npz"}
     assert [line.split()[0] for line in output.splitlines()[1:4]] == ["first", "last", "total"]
     first, *others = errors.splitlines()
     assert first == "torchrl-mcp-motions: 2 of 4 files were left out:"
     assert ["cut.txt" in others[0], "empty.bvh" in others[1]] == [True, True]
     status, output, errors = run("inspect", "cut.txt", "last.txt")
-    assert (status, output.splitlines()[1].split()[0]) == (2, "last")
+    assert (status, output.splitlines()[1].split()[0]) == (1, "last")
     assert errors.startswith("torchrl-mcp-motions: 1 of 2 files were left out:\ncut.txt")
 
 
@@ -102,7 +102,7 @@ def test_an_argument_that_is_wrong_for_all_files_is_named_once(run, tmp_path):
     for name in ("first", "last"):
         (tmp_path / f"{name}.txt").write_text(motion(1.0))
     status, output, errors = run("import", "first.txt", "last.txt", "--character", "lizard")
-    assert (status, output, errors.count("lizard"), len(errors.splitlines())) == (2, "", 1, 1)
+    assert (status, output, errors.count("lizard"), len(errors.splitlines())) == (1, "", 1, 1)
 
 
 def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
@@ -129,7 +129,7 @@ def test_a_mirror_image_replaces_no_other_clip(run, tmp_path):
     for name, length in (("walk", 1.0), ("walk_mirrored", 2.0)):
         (tmp_path / f"{name}.txt").write_text(motion(length))
     status, output, errors = run("import", "walk.txt", "walk_mirrored.txt", "--mirror", "--output", "clips")
-    assert (status, output) == (2, "")
+    assert (status, output) == (1, "")
     assert "a file and a mirror image are both called walk_mirrored: leave the file out, or --mirror" in errors
     assert not (tmp_path / "clips").exists()
     assert run("import", "walk.txt", "walk_mirrored.txt", "--output", "clips")[0] == 0
@@ -270,7 +270,7 @@ def corpus(folder, **seconds):
 def test_the_papers_corpus_lacks_what_was_not_downloaded(run, tmp_path):
     corpus(tmp_path / "downloads")
     status, _, errors = run("build-paper-corpus", "downloads")
-    assert status == 2
+    assert status == 1
     assert errors.startswith(
         "torchrl-mcp-motions: downloads lacks\n  0005_Walking001.bvh (from https://mocap.cs.sfu.ca"
     )
@@ -282,7 +282,7 @@ def test_the_papers_corpus_takes_no_other_motion_of_that_name(run, tmp_path, mon
     corpus(tmp_path / "downloads", **{"humanoid3d_long_walk2.txt": 20.0})
     (tmp_path / "downloads" / "0005_Walking001.bvh").write_text("?")
     status, _, errors = run("build-paper-corpus", "downloads")
-    assert status == 2
+    assert status == 1
     assert "humanoid3d_long_walk2.txt lasts 20.00 s, and the paper's corpus needs 24.56 s" in errors
 
 
@@ -348,7 +348,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
     for path in (tmp_path / "stand.txt", tmp_path / "more" / "stand.txt"):
         path.write_text(motion(1.0))
     status, output, errors = run(*words)
-    assert status == 2
+    assert status in (1, 2)
     assert output == ""
     assert re.search(message, errors)
     assert "Traceback" not in errors

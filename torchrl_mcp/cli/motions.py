@@ -1,7 +1,6 @@
 """``torchrl-mcp-motions``: import and inspect motion capture, and rebuild the paper's corpus."""
 
 import argparse
-import sys
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -25,23 +24,17 @@ examples:
 """
 
 
-@explained(PROGRAM)
+@explained(PROGRAM, BadZipFile, ImportError, RuntimeError)
 def main() -> None:
     """Run the command."""
     arguments = parser().parse_args()
-    try:
-        require_files(arguments)
-        from torchrl_mcp.commands import motions
-        from torchrl_mcp.runs.requirements import import_own
+    require_files(arguments)
+    from torchrl_mcp.commands import motions
+    from torchrl_mcp.runs.requirements import import_own
 
-        if arguments.module:
-            import_own(arguments.module, "--module names")
-        getattr(motions, arguments.run)(arguments)
-    except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
-        if sys.flags.dev_mode:
-            raise
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        sys.exit(2)
+    if arguments.module:
+        import_own(arguments.module, "--module names")
+    getattr(motions, arguments.run)(arguments)
 
 
 def require_files(arguments: argparse.Namespace) -> None:

@@ -30,13 +30,14 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
     return parser
 
 
-def explained(program: str) -> Callable[[Callable[[], None]], Callable[[], None]]:
+def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], None]], Callable[[], None]]:
     """Return a decorator of a command's function that ends it with a sentence if it is interrupted or its input is bad.
 
-    In Python's development mode (``-X dev``) it ends with a traceback.
+    In Python's development mode (``-X dev``) bad input ends it with a traceback.
 
     Args:
         program: Name of the command.
+        others: Errors, beside OSError, ValueError and YAML's, that are due to the command's input.
     """
 
     def decorate(main: Callable[[], None]) -> Callable[[], None]:
@@ -46,11 +47,11 @@ def explained(program: str) -> Callable[[Callable[[], None]], Callable[[], None]
                 main()
             except KeyboardInterrupt:
                 sys.exit(f"\n{program}: interrupted")
-            except yaml.YAMLError as error:
-                sys.exit(f"{program}: settings are no YAML: {' '.join(str(error).split())}")
-            except (OSError, ValueError) as error:
+            except (OSError, ValueError, yaml.YAMLError, *others) as error:
                 if sys.flags.dev_mode:
                     raise
+                if isinstance(error, yaml.YAMLError):
+                    sys.exit(f"{program}: settings are no YAML: {' '.join(str(error).split())}")
                 sys.exit(f"{program}: {error}")
 
         return run

@@ -22,7 +22,7 @@ examples:
 """
 
 
-@explained(PROGRAM)
+@explained(PROGRAM, RuntimeError)
 def main() -> None:
     """Run the command."""
     arguments = parse(sys.argv[1:])
@@ -41,10 +41,6 @@ def main() -> None:
 
         with trusting(arguments.trust):
             play(arguments)
-    except RuntimeError as error:
-        if sys.flags.dev_mode:
-            raise
-        sys.exit(f"{PROGRAM}: {error}")
     except KeyboardInterrupt:
         sys.exit()
 
