@@ -79,6 +79,28 @@ def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):
     assert all(0 < float(row["standing"]) < float(row["ideal"]) <= 1 for row in rows)
 
 
+def test_a_primitive_of_weight_0_is_out_of_the_product_and_the_others_keep_their_weights(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    lesion = runpy.run_path(str(BENCHMARKS / "lesions.py"))["Lesion"]
+    loc, scale, gates = torch.randn(5, 4, 3), torch.rand(5, 4, 3) + 0.1, torch.rand(5, 4)
+    others = [0, 1, 3]
+    lost = MultiplicativeGaussian(loc, scale, lesion(2, 0.0)(gates))
+    expected = MultiplicativeGaussian(loc[:, others], scale[:, others], gates[:, others])
+    torch.testing.assert_close((lost.mean, lost.stddev), (expected.mean, expected.stddev))
+    held = lesion(2, 0.7)(gates)
+    assert (held[:, 2] == 0.7).all()
+    assert torch.equal(held[:, others], gates[:, others])
+
+
+def test_the_biped_walks_intact_and_without_a_primitive(tmp_path):
+    intact, *lesions = run("lesions.py", tmp_path / "out.csv")
+    assert [row["lesion"] for row in lesions] == ["weight 0", "mean weight"]
+    for row in (intact, *lesions):
+        clips = [float(value) for name, value in row.items() if name.startswith("walk_")]
+        assert float(row["completed"]) == pytest.approx(sum(clips) / 14, abs=1e-3)
+    assert float(lesions[0]["steps"]) < float(intact["steps"]) <= 300
+
+
 def test_the_soak_damages_checkpoints_and_none_is_accepted_wrongly(tmp_path):
     rows = run("soak.py", tmp_path / "out.csv", "flips")
     assert [row["check"] for row in rows] == ["resume", "evaluate"]
