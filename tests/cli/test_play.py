@@ -76,6 +76,11 @@ def test_a_wrong_argument_of_the_task_is_refused(monkeypatch):
     assert "--task clip_end=sleep must be " in refused(monkeypatch, "builtin:biped", "--task", "clip_end=sleep")
 
 
+@pytest.mark.parametrize("name", ["seed", "num_envs", "device"])
+def test_an_argument_that_the_command_gives_itself_is_refused(monkeypatch, name):
+    assert f"--task {name} would not be read" in refused(monkeypatch, "builtin:biped", "--task", f"{name}=3")
+
+
 def test_without_opengl_the_packages_to_install_are_named(monkeypatch, tmp_path):
     monkeypatch.setattr(opengl, "_works", lambda name: False)
     opengl._platform.cache_clear()

@@ -61,8 +61,17 @@ def test_what_the_evaluation_would_refuse_is_refused_before_training(tmp_path, s
     assert not (tmp_path / "run" / "config.yaml").exists()
 
 
-@pytest.mark.parametrize(("name", "setting"), [("seed", "seed"), ("num_envs", "training.num_envs")])
+@pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        ("transfer.seed", "seed"),
+        ("transfer.num_envs", "training.num_envs"),
+        ("evaluation.seed", "evaluation.seed"),
+        ("evaluation.num_envs", "evaluation.episodes"),
+        ("evaluation.num_threads", "num_threads"),
+    ],
+)
 def test_arguments_of_environments_that_the_run_gives_are_refused_in_the_task(tmp_path, name, setting):
-    cfg = configure(tmp_path, "method=scratch", "task=heading", f"+task.transfer.{name}=3")
-    with pytest.raises(ValueError, match=f"task.transfer.{name} would not be read: give {setting} instead"):
+    cfg = configure(tmp_path, "method=scratch", "task=heading", f"+task.{name}=3")
+    with pytest.raises(ValueError, match=f"task.{name} would not be read: give {setting} instead"):
         experiment.train(cfg)

@@ -6,12 +6,17 @@ from omegaconf import OmegaConf
 
 from torchrl_mcp.runs.validation import wrong_values
 
+OWN = ("seed", "num_envs", "device", "episodes", "path")
+"""Names that the commands give themselves."""
+
 
 def task_settings(words: list[str]) -> dict[str, Any]:
     """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
     if lost := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
     settings = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
+    if own := [name for name in OWN if name in settings]:
+        raise ValueError(f"--task {own[0]} would not be read: what the command can change of it is in --help")
     if wrong := list(wrong_values(settings)):
         raise ValueError("\n".join(f"--task {line}" for line in wrong))
     return settings

@@ -20,6 +20,9 @@ from torchrl_mcp.runs.trust import require_trusted, targets
 SHARED = {name: name for name in ("seed", "device", "physics", "num_threads")} | {"num_envs": "training.num_envs"}
 """Arguments of environments that settings of the run give, by these."""
 
+EVALUATED = SHARED | {"seed": "evaluation.seed", "num_envs": "evaluation.episodes"}
+"""The same of environments that evaluate, which simulate on the CPU."""
+
 
 def require_all(cfg: DictConfig) -> None:
     """Check, before its folder is made or used, that a run can be made on this machine.
@@ -31,9 +34,9 @@ def require_all(cfg: DictConfig) -> None:
     require_callable(OmegaConf.to_container(cfg, resolve=True))
     require_files(cfg, cfg.task[cfg.stage.name])
     require_equipment(cfg)
-    for name, setting in SHARED.items():
-        if name in cfg.task[cfg.stage.name]:
-            raise ValueError(f"task.{cfg.stage.name}.{name} would not be read: give {setting} instead")
+    for section, given in ((cfg.stage.name, SHARED), ("evaluation", EVALUATED)):
+        if own := [name for name in given if name in (cfg.task.get(section) or ())]:
+            raise ValueError(f"task.{section}.{own[0]} would not be read: give {given[own[0]]} instead")
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
         ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
         raise ValueError(
