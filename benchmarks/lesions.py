@@ -10,7 +10,6 @@ primitive of one seed, and writes nothing unless given ``--output``.
 """
 
 import argparse
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
@@ -21,7 +20,6 @@ from report import about, table, write
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_mcp.envs import Imitation
 from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.runs import policies
 
@@ -49,15 +47,12 @@ class Lesion(nn.Module):
 
 def follow(network: Path, lesion: Lesion, *, episodes: int, threads: int) -> list[ClipResult]:
     """Follow every clip with a lesion, in ``episodes`` episodes each."""
-    alone = {"switch_interval": math.inf, "clip_end": "truncate", "num_threads": threads}
-    _, _, env = policies.restore(network, num_envs=1, seed=0, **alone)
-    num_envs = episodes * len(cast("Imitation", env).library)
-    _, agent, env = policies.restore(network, num_envs=num_envs, seed=12345, **alone)
+    agent, env = policies.restore_for_clips(network, episodes=episodes, seed=12345, num_threads=threads)
     *before, head = cast("ProbabilisticTensorDictSequential", agent.actor.policy)
     policy = ProbabilisticTensorDictSequential(
         *before, TensorDictModule(lesion, in_keys=["gates"], out_keys=["gates"]), head
     )
-    return follow_each(policy, cast("Imitation", env))
+    return follow_each(policy, env)
 
 
 def rows(seeds: list[int], primitives: int, *, episodes: int, threads: int) -> Iterator[dict[str, Any]]:

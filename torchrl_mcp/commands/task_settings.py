@@ -11,7 +11,11 @@ OWN = ("seed", "num_envs", "device", "episodes", "path")
 
 
 def task_settings(words: list[str]) -> dict[str, Any]:
-    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own."""
+    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own.
+
+    Raises:
+        ValueError: If a word has no value or a wrong one, or names what the command gives itself.
+    """
     if lost := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
     settings = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))

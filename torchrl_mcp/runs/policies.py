@@ -8,7 +8,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs import CharacterEnv, Imitation
 from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
@@ -133,11 +133,25 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> li
     Raises:
         ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
     """
+    agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **kwargs)
+    return follow_each(agent.actor.policy, env)
+
+
+def restore_for_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> tuple[Agent, Imitation]:
+    """Return a run's agent and new environments, in each of which an episode follows one clip and ends with it.
+
+    Args:
+        path: Run folder, for its newest checkpoint, or checkpoint file.
+        episodes: Number of environments per clip.
+        seed: Seed of the environments.
+        **kwargs: Arguments of the environments that replace the run's own.
+
+    Raises:
+        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+    """
     _, _, env = restore(path, num_envs=1, seed=seed, **kwargs)
     if not hasattr(env, "library"):
         raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
-    num_envs = episodes * len(env.library)
-    # An episode follows one clip, and ends with it.
     alone = {**kwargs, "switch_interval": math.inf, "clip_end": "truncate"}
-    _, agent, env = restore(path, num_envs=num_envs, seed=seed, **alone)
-    return follow_each(agent.actor.policy, env)
+    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, **alone)
+    return agent, cast("Imitation", env)
