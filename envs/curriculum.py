@@ -57,12 +57,14 @@ class Curriculum:
         """Return a curriculum, also from its arguments by name, or from None for the task's own episodes.
 
         Raises:
-            ValueError: If a name is unknown.
+            ValueError: If it is none of these, or a name is unknown.
         """
         if isinstance(given, Curriculum):
             return given
+        known = ", ".join(field.name for field in fields(cls))
+        if not isinstance(given, Mapping | None):
+            raise ValueError(f"curriculum={given} is no curriculum: pass null for none, or some of {known} by name")
         arguments = dict(given or {})
         if unknown := arguments.keys() - {field.name for field in fields(cls)}:
-            known = ", ".join(field.name for field in fields(cls))
             raise ValueError(f"curriculum names {sorted(unknown)}: pass some of {known}")
         return cls(**arguments)

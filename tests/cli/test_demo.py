@@ -200,7 +200,7 @@ def test_the_return_is_shown_once_full_episodes_can_have_ended(tmp_path):
     assert shown == {18: (18 * 1024, None), 29: (29 * 1024, 0.75)}
 
 
-@pytest.mark.parametrize("override", ["nonsense=1", "seed", "preset=unknown"])
+@pytest.mark.parametrize("override", ["nonsense=1", "seed", "evaluation.episodes=0"])
 def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, override):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-demo", "--output", str(tmp_path / "demo"), override])
     with pytest.raises(SystemExit, match=override.partition("=")[0]):
@@ -208,7 +208,7 @@ def test_a_wrong_setting_is_named_without_a_traceback(tmp_path, monkeypatch, ove
     assert not (tmp_path / "demo").exists()
 
 
-@pytest.mark.parametrize("override", ["character=biped", "+pretrained=mine", "method=moe"])
+@pytest.mark.parametrize("override", ["character=biped", "+pretrained=mine", "method=moe", "preset=fast"])
 def test_what_the_demonstration_sets_itself_cannot_be_set(tmp_path, monkeypatch, override):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-demo", "--output", str(tmp_path / "demo"), override])
     with pytest.raises(SystemExit, match=re.escape(f"use torchrl-mcp-train to set {override}")):

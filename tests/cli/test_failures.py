@@ -93,6 +93,12 @@ def test_in_development_mode_a_command_ends_with_a_traceback(words, tmp_path):
             ["evaluate", "builtin:biped", "--task", "max_episode_steps=abc"],
             "--task max_episode_steps=abc must be a whole number, at least 1",
         ),
+        (["evaluate", "builtin:biped", "--task", "speed=${"], "--task speed=${ cannot be read: "),
+        (["evaluate", "builtin:biped", "--task", "[=1"], "--task [=1 cannot be read: "),
+        (
+            ["evaluate", "builtin:biped-heading", "--task", "curriculum=none"],
+            "curriculum=none is no curriculum: pass null for none",
+        ),
     ],
     ids=lambda words: words[-1],
 )

@@ -123,6 +123,7 @@ def test_other_numbers_of_weights_than_the_reward_has_terms_are_refused(task, nu
     ("curriculum", "message"),
     [
         ({"emphasis": None}, r"curriculum names \['emphasis'\]: pass some of initial_states, motions, mixture"),
+        ("none", "curriculum=none is no curriculum: pass null for none, or some of initial_states, motions"),
         ({"discount": 0}, "discount=0 is out of range: pass the learner's, above 0 and at most 1"),
     ],
 )

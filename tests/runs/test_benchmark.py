@@ -208,6 +208,16 @@ def test_a_value_that_is_in_no_row_is_refused_with_those_that_are(tmp_path):
     benchmark.require_in_rows(rows, {"curriculum": ["mixed"], "seed": ["0"]})  # moe's row leaves them open
 
 
+@pytest.mark.parametrize(
+    "content", ["", "params: {}", "rows: {method: [mcp], width: [1]}", "rows: [{method: mcp}]", "rows: [mcp]"]
+)
+def test_a_benchmark_of_another_form_is_refused_with_the_form(tmp_path, content):
+    (tmp_path / "benchmark").mkdir()
+    (tmp_path / "benchmark" / "own.yaml").write_text(content)
+    with pytest.raises(ValueError, match=r"benchmark=own needs rows of lists: write rows: \[\{task: \[heading\]"):
+        jobs_of("benchmark=own", f"hydra.searchpath=[file://{tmp_path}]", f"run_root={tmp_path}")
+
+
 def test_settings_that_folders_do_not_tell_apart_are_not_varied(tmp_path):
     with pytest.raises(ValueError, match="autocast, would share the folder"):
         jobs_of("benchmark=smoke", f"run_root={tmp_path}", "method=scratch", "autocast=true,false")

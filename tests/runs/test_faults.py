@@ -83,6 +83,14 @@ def test_a_resume_that_fails_leaves_the_run_as_it_was(whole):
     assert status(whole).state == "done"
 
 
+@pytest.mark.parametrize("steps", [0, -1, 256.0, "abc"])
+def test_a_run_goes_on_for_a_number_of_steps(whole, steps):
+    before = contents(whole)
+    with pytest.raises(ValueError, match=f"training.total_frames={steps} must be a whole number, at least 1"):
+        experiment.resume(whole, total_frames=steps)
+    assert contents(whole) == before
+
+
 def test_a_run_that_was_stopped_can_end_where_it_is(killed, whole):
     experiment.resume(killed, total_frames=512)
     assert rows(killed) == rows(whole)[:4]

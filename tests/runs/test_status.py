@@ -125,6 +125,13 @@ def test_a_folder_that_is_not_there_is_named(monkeypatch):
         main()
 
 
+def test_a_configuration_of_another_program_is_no_run(runs):
+    files = runs / "finished" / "wandb" / "run-1" / "files"
+    files.mkdir(parents=True)
+    (files / "config.yaml").write_text("wandb_version: 1")
+    assert {one.folder.name for one in look(runs)} == {"finished", "killed", "alive", "later"}
+
+
 def test_a_damaged_run_is_a_line_that_says_so_and_the_others_are_shown(runs, tmp_path):
     damages = {
         "config.yaml": ["", "training: [", "training: {total_frames: many}", "a: &a [1]\nb: *a", "[" * 5000],

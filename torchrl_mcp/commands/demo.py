@@ -40,7 +40,7 @@ TITLES = {"pretrain": "primitives", "mcp": "MCP", "scratch": "scratch"}
 BUILTIN_STEPS = 10_649_600
 """Environment steps of imitation of the humanoid's primitives that come with the library."""
 
-OWN = ("character", "method", "pretrained", "run_dir", "stage", "task")
+OWN = ("character", "method", "preset", "pretrained", "run_dir", "stage", "task")
 """Settings that the demonstration makes itself."""
 
 RECENT = 10
@@ -106,6 +106,8 @@ def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: 
         for name, words in RUNS.items()
         if pretrain or name != "pretrain"
     }
+    if not runs["mcp"].evaluation.episodes:
+        raise ValueError("evaluation.episodes=0: the demonstration compares returns of episodes, give at least 1")
     runs["mcp"].pretrained = str(folder / "pretrain") if pretrain else "builtin"
     if pretrain:
         runs["scratch"].training.total_frames += runs["pretrain"].training.total_frames

@@ -3,6 +3,7 @@
 from typing import Any, cast
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mcp.runs.validation import wrong_values
 
@@ -14,11 +15,15 @@ def task_settings(words: list[str]) -> dict[str, Any]:
     """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own.
 
     Raises:
-        ValueError: If a word has no value or a wrong one, or names what the command gives itself.
+        ValueError: If a word cannot be read, has no value or a wrong one, or names what the command gives itself.
     """
     if lost := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
-    settings = cast("dict[str, Any]", OmegaConf.to_container(OmegaConf.from_dotlist(words)))
+    try:
+        given = OmegaConf.from_dotlist(words)
+    except (OmegaConfBaseException, LookupError) as error:
+        raise ValueError(f"--task {' '.join(words)} cannot be read: {' '.join(str(error).split())}") from error
+    settings = cast("dict[str, Any]", OmegaConf.to_container(given))
     if own := [name for name in OWN if name in settings]:
         raise ValueError(f"--task {own[0]} would not be read: what the command can change of it is in --help")
     if wrong := list(wrong_values(settings)):

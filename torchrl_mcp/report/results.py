@@ -23,6 +23,7 @@ from torchrl_mcp.training.run_folder import (
     MODES,
     NORMALISED_RETURN,
     PROVENANCE,
+    is_run,
     read_json,
     read_metrics,
 )
@@ -34,9 +35,6 @@ SAID = {"choices": str, "machine": str | int}
 
 MOST_FRAMES = 1e15
 """Upper bound on environment steps, above any training."""
-
-BESIDE = {CHECKPOINTS, EVALUATION, PROVENANCE}
-"""What tells a run without metrics from a ``config.yaml`` of another program."""
 
 REQUIRED = {
     "task.name": str,
@@ -232,7 +230,7 @@ def _run_folders(path: Path) -> Iterator[Path]:
             subfolders.clear()
             continue
         visited.add(real)
-        if METRICS in names or (CONFIG in names and BESIDE & {*names, *subfolders}):
+        if is_run([*names, *subfolders]):
             yield Path(folder)
             subfolders[:] = [name for name in subfolders if name != CHECKPOINTS]
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))

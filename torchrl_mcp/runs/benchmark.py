@@ -109,13 +109,14 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     settings, which several runs may share.
 
     Raises:
-        ValueError: If there are none, no row has a value, or two runs with different settings would share a folder.
+        ValueError: If there are none, the rows are no lists of values, no row has a value, or two runs with different
+            settings would share a folder.
     """
-    params = [f"{key}={value}" for key, value in master.benchmark.get("params", {}).items()]
+    rows = rows_of(master)
+    params = [f"{key}={value}" for key, value in (master.benchmark.get("params") or {}).items()]
     given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
     overrides = OverridesParser.create(config_loader=loader).parse_overrides([*params, *given])
     choices = {override.get_key_element(): values(override) for override in overrides}
-    rows: Any = OmegaConf.to_container(master.benchmark.rows)
     require_in_rows(rows, choices)
     pretraining: dict[tuple[str, ...], Job] = {}
     transfer: list[Job] = []
@@ -132,6 +133,23 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     jobs = [*pretraining.values(), *transfer]
     require_own_folders(jobs)
     return jobs
+
+
+def rows_of(master: DictConfig) -> list[dict[str, list[Any]]]:
+    """Return the rows of the benchmark ``master.benchmark``.
+
+    Raises:
+        ValueError: If its file has another form.
+    """
+    content = OmegaConf.to_container(master.benchmark)
+    rows: Any = content.get("rows") if isinstance(content, dict) else None
+    fits = isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
+    if not fits or not all(isinstance(values, list) for row in rows for values in row.values()):
+        raise ValueError(
+            f"benchmark={master.hydra.runtime.choices.benchmark} needs rows of lists: write "
+            "rows: [{task: [heading], method: [mcp, moe]}] in its file"
+        )
+    return rows
 
 
 def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> Iterator[Settings]:

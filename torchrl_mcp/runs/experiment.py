@@ -52,7 +52,7 @@ def resume(
         ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, it has taken
             more than ``total_frames``, or this machine lacks the device, the logger or a file. The run is as before.
     """
-    if is_complete(folder) and not total_frames and not moves:
+    if is_complete(folder) and total_frames is None and not moves:
         return folder
     known = places.outside(read_config(folder / CONFIG))
     if unknown := sorted(set(moves or {}) - set(known)):

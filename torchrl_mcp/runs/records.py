@@ -13,6 +13,7 @@ from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import continuation, provenance
 from torchrl_mcp.runs.requirements import require_known
 from torchrl_mcp.runs.trust import read_config, resuming
+from torchrl_mcp.runs.validation import wrong_values
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.precision import Precision, choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, read_json, replacing, write_json
@@ -132,11 +133,13 @@ def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) 
         moves: New places, by the names of their settings; names that the run lacks are ignored.
 
     Raises:
-        ValueError: If the folder holds no run, or the run has taken more steps than another length.
+        ValueError: If the folder holds no run, or another length is no number of steps or less than the run has taken.
     """
     held = _held(folder)
     planned = held["training"]["total_frames"]
-    total = total_frames or planned
+    total = planned if total_frames is None else total_frames
+    if wrong := list(wrong_values({"training": {"total_frames": total}})):
+        raise ValueError(wrong[0])
     if total != planned and total < (taken := run_folder.frames(checkpoint.find(folder))):
         raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
     known = places.outside(held)

@@ -25,7 +25,16 @@ from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.runs.trust import read_config
 from torchrl_mcp.training import run_folder
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, LOG, METRICS, NORMALISED_RETURN, read_json, write_json
+from torchrl_mcp.training.run_folder import (
+    CONFIG,
+    EVALUATION,
+    LOG,
+    METRICS,
+    NORMALISED_RETURN,
+    is_run,
+    read_json,
+    write_json,
+)
 
 MANIFEST = "benchmark-{}.json"
 STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
@@ -95,7 +104,8 @@ def look(folder: Path, runs: Runs | None = None) -> list[Status]:
     """Return the status of ``runs``, or of all runs that are in ``folder`` or planned by benchmarks there."""
     damaged: list[Status] = []
     if runs is None:
-        found: dict[Path, int | None] = {path.parent.resolve(): None for path in sorted(folder.rglob(CONFIG))}
+        configs = sorted(path for path in folder.rglob(CONFIG) if is_run(os.listdir(path.parent)))
+        found: dict[Path, int | None] = {path.parent.resolve(): None for path in configs}
         for path in sorted(folder.rglob(MANIFEST.format("*"))):
             try:
                 found |= read_manifest(path)

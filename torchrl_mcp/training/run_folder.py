@@ -7,7 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,11 @@ LARGEST = 2**24
 
 STALE = 3600.0
 """Seconds after which no process can still be reading a checkpoint."""
+
+
+def is_run(names: Collection[str]) -> bool:
+    """Return whether a folder with these files and folders is of a run, and not another program's ``config.yaml``."""
+    return METRICS in names or (CONFIG in names and not {CHECKPOINTS, EVALUATION, PROVENANCE}.isdisjoint(names))
 
 
 @contextmanager
