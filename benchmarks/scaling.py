@@ -154,7 +154,6 @@ def count() -> dict[str, float]:
         trainer.actor.policy(batch)
     counts |= {"forward_operations": operations.count, "forward_flops": flops.get_total_flops() / MINIBATCH}
     batch = batch.update({"advantage": torch.zeros(MINIBATCH, 1), "value_target": torch.zeros(MINIBATCH, 1)})
-    batch = batch.update({"state_value": torch.zeros(MINIBATCH, 1)})
     with Operations() as operations, FlopCounterMode(display=False) as flops:
         for name in trainer.optimizers:
             trainer._learn(name, batch, [torch.arange(MINIBATCH)])

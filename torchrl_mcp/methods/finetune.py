@@ -4,14 +4,14 @@ r"""The finetuning model (Section E.3): one motion is imitated, then the goals o
     \pi(a|s, g) = \mathcal{N}(\mu(s, J g), \Sigma), \qquad J = 0
 
 As in Berseth et al., the inputs of pre-training stay, and new ones enter the first layer with weights of zero. The
-first policy of the task equals the pre-trained policy bit for bit, for any goal; then all weights train. The paper
-injects "goal inputs g that are not present during training", hence the policy imitates its motion blindly, from the
-state alone. The critic sees the reference, and is re-initialised for the task. If pre-training has the task's own goal,
-as in the holdout, the policy sees it from the start and keeps its weights.
+task begins with the means of the pre-trained policy bit for bit, for any goal, and with new noise (``restart_noise``);
+then all weights train. The paper injects "goal inputs g that are not present during training", hence the policy
+imitates its motion blindly, from the state alone. The critic sees the reference, and is re-initialised for the task. If
+pre-training has the task's own goal, as in the holdout, the policy sees it from the start and keeps its weights.
 
 A policy that does see the reference (``parts.blind=false`` in pre-training) is transferred in the same way. Its weights
 for the reference are dropped. This amounts to holding these inputs at their mean over pre-training, zero after
-normalisation: the first policy of the task equals, bit for bit, the pre-trained policy at that mean.
+normalisation: the task begins, bit for bit, with the means of the pre-trained policy at that mean.
 
 Reference:
     Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808

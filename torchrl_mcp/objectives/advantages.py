@@ -32,7 +32,7 @@ class Advantages:
         Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage Estimation*, 2016.
     """
 
-    out_keys = ("advantage", "value_target", "state_value")
+    out_keys = ("advantage", "value_target")
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
         self.critic, self.clip = critic, clip
@@ -44,7 +44,6 @@ class Advantages:
         value = self._values(batch)
         advantage, batch["value_target"] = self.gae(batch, value, upon_arrival(value, batch, self._values))
         batch["advantage"] = normalised(advantage, self.clip)
-        batch["state_value"] = value
         return batch
 
     def _values(self, states: TensorDictBase) -> Tensor:

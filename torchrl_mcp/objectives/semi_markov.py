@@ -38,7 +38,7 @@ class SemiMarkovAdvantages:
         learning*, 1999. https://doi.org/10.1016/S0004-3702(99)00052-1
     """
 
-    out_keys = ("advantage", "value_target", "state_value")
+    out_keys = ("advantage", "value_target")
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
         self.critic, self.gamma, self.lmbda, self.clip = critic, gamma, lmbda, clip
@@ -64,7 +64,6 @@ class SemiMarkovAdvantages:
         choices = batch[begins]
         choices["advantage"] = normalised((target - value)[begins], self.clip)
         choices["value_target"] = target[begins]
-        choices["state_value"] = value[begins]
         return choices
 
     def _targets(self, batch: TensorDictBase, value: Tensor) -> Tensor:

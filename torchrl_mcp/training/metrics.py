@@ -10,8 +10,6 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torchrl_mcp.training.run_folder import CSV_LOGGER, METRICS, flush, replacing
 
-"""Folder of the files of TorchRL's csv logger in a run folder, with lines ``step,value``."""
-
 
 def begin_after(logger: Logger, frames: int) -> None:
     """Make TensorBoard drop the values that a killed run logged after environment step ``frames``.
@@ -73,7 +71,7 @@ class MetricsWriter:
         if (last := int(kept[-1]["iteration"]) if kept else 0) < iteration:
             raise ValueError(
                 f"{self.path} ends after {last} iterations, the checkpoint is of iteration {iteration}: put the file "
-                "back from a copy, or train in a new folder with stage=pretrain pretrained=<checkpoint file>"
+                "back from a copy, or train anew in another folder"
             )
         if not self.path.exists():
             return

@@ -43,7 +43,7 @@ PARTIAL = ".partial"
 """Suffix of the name of a file that is being written."""
 
 CSV_LOGGER = "csv/scalars"
-"""The folder of TorchRL's csv logger."""
+"""The folder of the files of TorchRL's csv logger, with lines ``step,value``."""
 
 UNPACKED = "torchrl-checkpoint-load-*"
 """Folders into which TorchRL unpacks checkpoints to read them, in the system's folder for temporary files."""
