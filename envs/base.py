@@ -27,8 +27,9 @@ class CharacterEnv(EnvBase):
 
     A task defines :meth:`initial_state`, :meth:`observe` and :meth:`reward`, and where it needs them
     :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal` and :meth:`normalised_return`. This
-    class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. The state of a task
-    beyond the physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
+    class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. All simulations step
+    together: under TorchRL's mask ``_step`` they do as well, and it masks their outputs. The state of a task beyond the
+    physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
     :meth:`make_specs`.
 
     A simulation that diverges or gets a non-finite action ends only its own episode: it is ``terminated``, with reward
@@ -316,7 +317,7 @@ class CharacterEnv(EnvBase):
         all simulations after a partial reset, which need no merging.
         """
         if tensordict.batch_size != self.batch_size or "next" in tensordict or "_step" in tensordict:
-            return super().step_and_maybe_reset(tensordict)  # the caller sets the outcome, or the simulations that step
+            return super().step_and_maybe_reset(tensordict)  # the caller sets or masks the outcome
         outcome = self._step(tensordict)
         tensordict.set("next", outcome)
         state = self._step_mdp(tensordict)

@@ -1,5 +1,6 @@
 """Returns of players without a body: of one that stands still, and of one that does what a task asks for."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -40,6 +41,7 @@ def transport_reach(
     timestep: float,
     num_steps: int,
     success_distance: float = 0.0,
+    success_reach: float = math.inf,
 ) -> Reach:
     """Returns of a player that goes straight to an object, takes it straight to its target, and then waits.
 
@@ -53,11 +55,13 @@ def transport_reach(
         timestep: Duration of a step in seconds.
         num_steps: Steps of the episode.
         success_distance: Metres between object and target below which the reward is 1; 0 for none.
+        success_reach: Metres between player and object below which it is.
     """
 
     def reward_of(*state: Tensor) -> Tensor:
-        left = torch.linalg.vector_norm(state[2] - state[4], dim=-1)
-        return reward(*state).masked_fill(left < success_distance, 1.0)
+        com, _, position, _, target = state
+        left, away = (torch.linalg.vector_norm(position - other, dim=-1) for other in (target, com))
+        return reward(*state).masked_fill((left < success_distance) & (away < success_reach), 1.0)
 
     still, stride = torch.zeros_like(com), speed * timestep
     standing = num_steps * reward_of(com, still, position, still, target)

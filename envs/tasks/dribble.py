@@ -95,7 +95,7 @@ class Dribble(Transport):
 
     objects = OBJECTS
     reward_of = staticmethod(dribble_reward)
-    success_distance = SUCCESS_DISTANCE
+    success_distance, success_reach = SUCCESS_DISTANCE, SUCCESS_REACH
 
     def __init__(
         self,

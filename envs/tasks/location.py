@@ -124,6 +124,7 @@ class Location(PDCharacterEnv):
         episode["arrived"].copy_(near(self.com, torch.nn.functional.pad(episode["target"], (0, 1)), ARRIVAL_DISTANCE))
         stands = torch.linalg.vector_norm(self.velocity("com")[:, :2], dim=-1) < STANDING_SPEED
         episode["success"].copy_(episode["arrived"] & stands & (self._alignment() > FACING) & ~self.fallen())
+        episode["success"][diverged] = False  # who could not move does not stand
         episode["reached"] |= episode["success"]
 
     def reward(self) -> Tensor:

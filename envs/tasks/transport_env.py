@@ -1,5 +1,6 @@
 """What the tasks of carrying and dribbling share."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -48,6 +49,9 @@ class Transport(PDCharacterEnv):
 
     success_distance: ClassVar[float]
     """Distance in metres from the target at which an ideal player succeeds."""
+
+    success_reach: ClassVar[float] = math.inf
+    """Distance in metres from the object within which a player must be to succeed."""
 
     _object: Tensor
     _target: Tensor
@@ -101,6 +105,7 @@ class Transport(PDCharacterEnv):
             timestep=self.control_timestep,
             num_steps=self.max_episode_steps,
             success_distance=self.success_distance if self.success_reward else 0.0,
+            success_reach=self.success_reach,
         )
 
     def goal_mirror(self) -> Mirror:

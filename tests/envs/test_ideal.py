@@ -76,6 +76,17 @@ def test_who_does_nothing_and_does_not_fall_earns_what_standing_still_does(task)
     torch.testing.assert_close(returns.squeeze(-1), standing.float(), rtol=0.05, atol=0.0)
 
 
+def test_standing_far_from_a_ball_at_its_target_is_no_success():
+    ranges = {"object_distances": (3, 5), "target_distances": (0, 0.4)}
+    env = Dribble("biped", 4, seed=0, num_threads=1, max_episode_steps=5, success_reward=True, **ranges)
+    state = env.reset()
+    standing, returns = env.reach().standing, torch.zeros(4, 1)
+    for _ in range(5):
+        state = env.step(state.set("action", torch.zeros(env.action_spec.shape)))["next"]
+        returns += state["reward"]
+    torch.testing.assert_close(returns.squeeze(-1), standing.float(), rtol=0.05, atol=0.0)
+
+
 def test_with_a_reward_for_success_the_ideal_is_higher_in_every_episode():
     reaches = []
     for success_reward in (False, True):

@@ -68,6 +68,18 @@ def test_the_reward_of_a_step_is_for_the_displacement_of_the_centre_of_mass_and_
     assert not torch.equal(env.episode["target"][0], vector(2.0, 1.0))  # drawn after the reward
 
 
+def test_who_could_not_move_at_its_place_has_not_succeeded():
+    env = make(2)
+    start = stand(env)
+    start = env.reset(env.get_state().set("target", env.com[:, :2].clone()), set_state=True)
+    action = torch.zeros(env.action_spec.shape)
+    action[0] = torch.nan
+    after = env.step(start.set("action", action))["next"]
+    assert after["terminated"].flatten().tolist() == [True, False]
+    assert after["success"].flatten().tolist() == [False, True]
+    assert env.episode["reached"].tolist() == [False, True]
+
+
 def _centre(env):
     """Centre of mass of the first simulation, from MuJoCo's positions and masses."""
     data, masses = env.simulation.data(0), env.simulation.model.body_mass
