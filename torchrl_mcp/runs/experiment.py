@@ -49,8 +49,9 @@ def resume(
         moves: New places of files and folders outside the run folder, by the names of their settings.
 
     Raises:
-        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, it has taken
-            more than ``total_frames``, or this machine lacks the device, the logger or a file. The run is as before.
+        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, ``total_frames``
+            is no number of steps or less than it has taken, or this machine lacks the device, the logger or a file. The
+            run is as before.
     """
     if is_complete(folder) and total_frames is None and not moves:
         return folder

@@ -56,7 +56,7 @@ STALE = 3600.0
 
 
 def is_run(names: Collection[str]) -> bool:
-    """Return whether a folder with these files and folders is of a run, and not another program's ``config.yaml``."""
+    """Return whether a folder with entries of these names holds a run; a ``config.yaml`` may be another program's."""
     return METRICS in names or (CONFIG in names and not {CHECKPOINTS, EVALUATION, PROVENANCE}.isdisjoint(names))
 
 
