@@ -1,3 +1,4 @@
+import ctypes
 import gc
 import os
 import runpy
@@ -18,17 +19,73 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import settings
 from omegaconf import OmegaConf
+from torchrl.envs import EnvBase
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions import generated_library
-
-# Small tensors: a thread pool costs more than it gives, and results must not depend on the machine's cores.
-torch.set_num_threads(1)
 
 # An example's time says nothing here (first calls compile and allocate); in CI the same examples run every time.
 settings.register_profile("default", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+def pytest_addoption(parser):
+    group = parser.getgroup("other processors", "for tests of trajectories, see tests/support/processors.py")
+    group.addoption("--threads", type=int, default=1, help="threads of networks")
+    group.addoption("--bfloat16", action="store_true", help="compute networks in bfloat16")
+    group.addoption("--shift-seeds", type=int, default=0, metavar="N", help="add N to all seeds")
+    group.addoption("--perturbations", type=int, default=0, metavar="N", help="repeat with N changes of the last bit")
+
+
+def pytest_configure(config):
+    # Small tensors: a thread pool costs more than it gives, and results must not depend on the machine's cores.
+    torch.set_num_threads(config.getoption("threads"))
+
+
+def pytest_generate_tests(metafunc):
+    """Repeat tests of trajectories as on as many other processors as asked for."""
+    repetitions = metafunc.config.getoption("perturbations")
+    if repetitions and metafunc.definition.get_closest_marker("trajectories"):
+        metafunc.fixturenames.append("perturbation")
+        metafunc.parametrize("perturbation", range(repetitions))
+
+
+@pytest.fixture(autouse=True)
+def _another_processor(request, monkeypatch):
+    """Change tests of trajectories as options say: seeds, the precision, or the first observation of an episode."""
+    if not request.node.get_closest_marker("trajectories"):
+        yield
+        return
+    if shift := request.config.getoption("shift_seeds"):
+        set_seed, manual_seed = EnvBase.set_seed, torch.manual_seed
+        monkeypatch.setattr(torch, "manual_seed", lambda seed: manual_seed(seed + shift))
+        monkeypatch.setattr(
+            EnvBase,
+            "set_seed",
+            lambda env, seed=None, **kwargs: set_seed(env, None if seed is None else seed + shift, **kwargs),
+        )
+    if "perturbation" in request.fixturenames:
+        generator = torch.Generator().manual_seed(request.getfixturevalue("perturbation"))
+        reset = EnvBase.reset
+
+        def perturbed(env, *arguments, **settings):
+            state = reset(env, *arguments, **settings)
+            observation = state["observation"]
+            observation *= 1 + 1e-7 * torch.randn(observation.shape, generator=generator)
+            return state
+
+        monkeypatch.setattr(EnvBase, "reset", perturbed)
+    with torch.autocast("cpu", torch.bfloat16, enabled=request.config.getoption("bfloat16")):
+        yield
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Return the memory of a file's tests to the system: the collector passes seldom, and the allocator keeps pages."""
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def pytest_collection_finish():

@@ -92,7 +92,8 @@ def test_a_primitive_of_weight_0_is_out_of_the_product_and_the_others_keep_their
     assert torch.equal(held[:, others], gates[:, others])
 
 
-def test_the_biped_walks_intact_and_without_a_primitive(tmp_path):
+@pytest.mark.trajectories
+def test_the_biped_walks_longer_intact_than_without_a_primitive(tmp_path):
     intact, *lesions = run("lesions.py", tmp_path / "out.csv")
     assert [row["lesion"] for row in lesions] == ["weight 0", "mean weight"]
     for row in (intact, *lesions):

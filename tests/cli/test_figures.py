@@ -127,6 +127,7 @@ def test_exploration_repeats_itself_with_the_same_seed(runs, tmp_path, monkeypat
     assert first == second
 
 
+@pytest.mark.trajectories
 def test_primitives_that_come_with_the_library_walk_in_step_with_their_reference(tmp_path, monkeypatch, capsys):
     settings = ["--walkers", 2, "--seconds", 4, "--output", tmp_path]
     call(monkeypatch, "primitives", "builtin:biped", *settings)

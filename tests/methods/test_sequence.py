@@ -102,7 +102,8 @@ def test_acts_over_other_primitives_and_bad_durations_are_refused():
         GatesInARow(env, [act(here, [0.0, 0.0])], crossfade=-1.0)
 
 
-def test_built_in_gates_walk_to_the_ball_and_then_dribble():
+@pytest.mark.trajectories
+def test_built_in_gates_walk_to_the_ball_and_then_kick_it():
     """The heading gate walks towards the ball; near it, the dribbling gate takes over and the ball moves."""
     settings = {"object_distances": (3.0, 3.0), "object_directions": (0.0, 0.0), "max_episode_steps": 450}
     _, heading, _ = restore(builtin("mcp", "biped", "heading"), num_envs=1, seed=0)
@@ -126,12 +127,15 @@ def test_built_in_gates_walk_to_the_ball_and_then_dribble():
     reached = None
     for step in range(240):
         player.step()
-        assert not player.began
         if reached is None and int(policy.act[0]) == 1:
             reached = step
+        if float((ball() - start).norm()) > 0.3:  # 3.0 m in the end, with a standard deviation of 0.7 m
+            break
+        assert not player.began  # no fall
+    else:
+        pytest.fail("the ball was not kicked")
     assert reached is not None
     assert 30 < reached < 150  # two metres at about a metre per second
-    assert float((ball() - start).norm()) > 0.5
 
 
 def test_the_place_of_the_location_task_is_seen_in_other_tasks():

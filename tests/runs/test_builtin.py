@@ -143,12 +143,13 @@ def test_a_command_line_names_a_path_or_what_comes_with_the_library(tmp_path):
         builtin.locate("builtin:dog")
 
 
+@pytest.mark.trajectories
 @pytest.mark.parametrize(
     "path",
     sorted(file for file in builtin.FOLDER.glob("*.torchrl") if not builtin.has_task(file)),
     ids=lambda path: path.stem,
 )
 def test_what_comes_with_the_library_follows_its_motions(path):
-    results = policies.evaluation(path, episodes=8, seed=0, max_episode_steps=30)
-    assert results["deterministic"]["terminated"] <= 0.25
-    assert results["deterministic"]["metrics"]["tracking_error"] < 0.15
+    results = policies.evaluation(path, episodes=16, seed=0, max_episode_steps=30)
+    assert results["deterministic"]["terminated"] <= 0.25  # of 24 seeds 0.013 on average, 0.06 at most
+    assert results["deterministic"]["metrics"]["tracking_error"] < 0.1  # 0.043 with a standard deviation of 0.006

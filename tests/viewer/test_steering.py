@@ -64,6 +64,7 @@ def test_let_go_the_direction_wanders_again():
     assert 0 < abs(target(steering) - 1.0) <= 0.15
 
 
+@pytest.mark.trajectories
 def test_the_humanoid_walks_where_it_is_steered():
     _, agent, env = restore(builtin("mcp", "humanoid", "heading"), num_envs=1, seed=0, curriculum=None)
     steering = Steering(Player(agent.actor.policy, env))
@@ -79,6 +80,7 @@ def test_the_humanoid_walks_where_it_is_steered():
         assert math.degrees(math.atan2(way[1], way[0])) == pytest.approx(angle, abs=15.0)
 
 
+@pytest.mark.trajectories
 def test_the_humanoid_that_goes_to_places_walks_at_the_speed_and_in_the_direction_of_keys_and_stands_after_a_stop():
     _, agent, env = restore(builtin("mcp", "humanoid", "location"), num_envs=1, seed=0, curriculum=None)
     steering = Steering(Player(agent.actor.policy, env))

@@ -100,6 +100,7 @@ def test_the_biped_withstands_a_push(push, scene):
     assert np.abs(data.qvel).max() < 0.01
 
 
+@pytest.mark.trajectories
 @pytest.mark.parametrize("height", [0.0, 1.0])
 def test_random_actions_do_not_make_it_diverge(character, height, scene):
     model = scene(character)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from chance import require_share
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -12,12 +13,12 @@ from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.training import checkpoint
 
-TRIALS, STEPS = 8, 150
+TRIALS, STEPS = 16, 150
 AHEAD = {"biped": 1.2, "humanoid": 1.2, "trex": 2.2}  # metres to the box
 
 
 class Guide:
-    """The built-in network of a character, which follows a walk along x that waits for it, from eight moments on."""
+    """The built-in network of a character, which follows a walk along x that waits for it, from sixteen moments on."""
 
     def __init__(self, character):
         walk, terms = single_motion(character), {"pose": {"weight": 1.0, "scale": 1.0}}
@@ -26,7 +27,7 @@ class Guide:
         agent = build.make_agent(policies.policy_config(file), self.env)
         checkpoint.load_agent(agent.parts, file)
         self.policy, self.walk = agent.actor.policy, walk
-        self.times = 0.15 * torch.arange(TRIALS, dtype=torch.float64)
+        self.times = 0.075 * torch.arange(TRIALS, dtype=torch.float64)
         self.begun = self.env.beginning(torch.zeros(TRIALS, dtype=torch.int64), self.times)
         way = self.places(self.times + 1) - self.places(self.times)
         self.forward = way / way.norm(dim=-1, keepdim=True)
@@ -45,8 +46,9 @@ class Guide:
         return self.policy(seen.select(*self.policy.in_keys))["action"]
 
 
+@pytest.mark.trajectories
 @pytest.mark.parametrize("character", AHEAD)
-def test_who_walks_through_the_box_carries_it_past_the_source(character):
+def test_most_who_walk_through_the_box_carry_it_past_the_source(character):
     guide, env = Guide(character), Carry(character, TRIALS, seed=0, num_threads=1)
     env.reset()
     state = env.get_state()
@@ -66,5 +68,4 @@ def test_who_walks_through_the_box_carries_it_past_the_source(character):
             state = env.get_state()
             beyond = ((state["qpos"][:, -7:-5] - source) * guide.forward).sum(-1)
             past |= (beyond > 1) & (state["eq_active"][:, 0] == 1) & ~fallen
-    assert env.episode["taken"].all()
-    assert past.sum() > TRIALS / 2
+    require_share(past & (env.episode["taken"] == 1), 0.95)  # 99 to 100 % of 128

@@ -1,0 +1,47 @@
+"""The tests of trajectories as on other processors: other kernels, other roundings, other seeds.
+
+    python tests/support/processors.py
+
+A trained policy in a loop with physics is chaotic: a rounding of the last bit gives other trajectories after a second. So
+the tests that are marked with ``trajectories`` have bounds from distributions. This command runs them with the kernels of
+other processors, with more threads, in bfloat16, with other seeds, and, as the surest stand-in for a processor that is not
+at hand, with first observations that differ by a relative 1e-7, with twenty seeds.
+"""
+
+import os
+import subprocess
+import sys
+
+PYTEST = (sys.executable, "-m", "pytest", "-m", "trajectories and not slow", "-q", "-n", "2", "--no-header")
+VARIANTS: tuple[tuple[dict[str, str], tuple[str, ...]], ...] = (
+    ({"ATEN_CPU_CAPABILITY": "default"}, ()),
+    ({"ATEN_CPU_CAPABILITY": "avx2"}, ()),
+    ({"ATEN_CPU_CAPABILITY": "avx512"}, ()),
+    ({"ONEDNN_MAX_CPU_ISA": "SSE41"}, ()),
+    ({"ONEDNN_MAX_CPU_ISA": "AVX2"}, ()),
+    ({"MKL_CBWR": "COMPATIBLE"}, ()),
+    ({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA"}, ()),  # sines and cosines of the physics
+    ({}, ("--threads=2",)),
+    ({}, ("--bfloat16",)),
+    ({}, ("--shift-seeds=1",)),
+    ({}, ("--perturbations=20",)),
+)
+"""Variables of the environment and options of pytest."""
+
+
+def main() -> None:
+    """Run the tests in every variant, print a line for each, and end with 1 if any failed."""
+    failures = 0
+    for variables, options in VARIANTS:
+        name = " ".join([*(f"{key}={value}" for key, value in variables.items()), *options])
+        done = subprocess.run([*PYTEST, *options], env={**os.environ, **variables}, capture_output=True, text=True)
+        lines = done.stdout.splitlines()
+        print(f"{name}: {lines[-1] if lines else done.stderr}", flush=True)
+        if done.returncode:
+            failures += 1
+            print("\n".join(line for line in lines if line.startswith(("FAILED", "ERROR", "E  "))), flush=True)
+    sys.exit(1 if failures else 0)
+
+
+if __name__ == "__main__":
+    main()
