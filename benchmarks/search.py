@@ -1,76 +1,173 @@
-r"""Search of settings at equal processor time: every trial trains for the same CPU seconds on one core.
+r"""Search of settings at equal processor time: every trial of every method trains for the same CPU seconds on one core.
 
-    python benchmarks/search.py heading mcp pretrained=builtin stage=transfer --seconds 90 --trials 14
-    python benchmarks/search.py heading mcp pretrained=builtin stage=transfer --seconds 120 --seeds 100 101 \
-        --candidate large="training.num_envs=128 training.frames_per_batch=4096" --candidate small=
+    python benchmarks/search.py carry mcp --minutes 15
+    python benchmarks/search.py dribble latent_space --minutes 40
+    python benchmarks/search.py carry mcp --minutes 15 --seeds 100 101 102 103 104 \
+        --candidate default= --candidate large="training.num_envs=512 training.frames_per_batch=16384"
 
-Optuna's TPE sampler proposes settings, each of them an argument of ``torchrl-mcp-train``. A trial is stopped by its CPU
-seconds, counted from the first step on, so that other work on the machine does not falsify the comparison. Its score is
-the mean of two returns: the mean of the episodes of training that ended in the last fifth of the time, and that of 64
-deterministic episodes of the printed task. Trials with a training return below the median of the others at half the
-time are given up. Repeated, the command goes on with the trials that are missing. With candidates, it compares these
-alone, one run per seed, in a table of their own.
+Protocol, the same for all methods and tasks, in float32 with the biped:
 
-Optuna 4 or newer does not go with Hydra's plugin: install it in an environment of its own.
+* A trial is a set of settings, arguments of ``torchrl-mcp-train``, proposed by Optuna's TPE sampler. The first two
+  trials are today's defaults, and the defaults with large batches. Every method has the same number of trials.
+* A trial trains with two seeds, 100 and 101, which no table uses, from one pre-training of the method (5 M steps).
+  A run is stopped by its CPU seconds, counted from its first step on, so that other work does not falsify the
+  comparison. Trials of one study belong on one processor; its name is in each row.
+* After a quarter of the time each seed plays 128 deterministic and 128 exploring episodes of the printed task. Optuna's
+  successive halving (reduction factor 4) ends the trial unless it is among the best quarter so far. The others train to
+  the end of the time and play again.
+* The score is the mean over seeds, deterministic and exploring episodes of success plus normalised return. A task
+  without success is scored by its return alone.
+
+Repeated, the command goes on with the trials that are missing. With candidates, it trains these alone, to the end, with
+every seed, in a table of their own. Optuna 4 or newer does not go with Hydra's plugin: install it in an environment of
+its own.
 """
 
 import argparse
 import csv
 import json
-import math
 import os
+import platform
 import shutil
 import signal
 import subprocess
+import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import mean
+from typing import Any
 
-import optuna
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+SEEDS = (100, 101)
+"""Seeds of the trials; tables use seeds from 0 on."""
 
-from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
+EVALUATION_SEED = "777"
+EPISODES = "128"
 
-SEED = 100
-"""First seed of the trials; tables use seeds from 0 on."""
+PRETRAINED = Path(__file__).parent / "results" / "table2" / "networks"
 
-FIXED = ("logger=none", "progress_bar=false", "torch_threads=1", "num_threads=1", "keep_checkpoints=1",
-         "evaluation.episodes=0", "training.total_frames=1_000_000_000")  # fmt: skip
+FIXED = ("character=biped", "stage=transfer", "autocast=false", "logger=none", "progress_bar=false", "torch_threads=1",
+         "num_threads=1", "keep_checkpoints=1", "evaluation.episodes=0", "training.total_frames=1_000_000_000")  # fmt: skip
+
+STEPS_PER_CHECKPOINT = 65_536
+
 TICKS = os.sysconf("SC_CLK_TCK")
 
+BATCHES = {"1024": (32, 1024), "4096": (128, 4096), "16384": (512, 16_384)}
+"""Environments and steps of a batch."""
 
-def suggest(trial: optuna.Trial, method: str) -> list[str]:
-    """Return the settings of a trial."""
-    num_envs = trial.suggest_categorical("num_envs", [16, 32, 64, 128])
-    horizon = trial.suggest_categorical("horizon", [16, 32, 64])
-    minibatch = min(trial.suggest_categorical("minibatch_size", [128, 256, 512]), num_envs * horizon)
-    words = [
-        f"training.num_envs={num_envs}",
-        f"training.frames_per_batch={num_envs * horizon}",
-        f"training.minibatch_size={minibatch}",
-        f"training.num_epochs={trial.suggest_categorical('num_epochs', [2, 4, 8])}",
-        f"step_size.actor={trial.suggest_categorical('lr', [6e-5, 3e-4, 1e-3])}",
-        f"step_size.max={trial.suggest_categorical('max_lr', [5e-4, 1e-3, 2e-3])}",
-        f"step_size.target_kl={trial.suggest_categorical('target_kl', [0.01, 0.02, 0.05, 0.1])}",
-        f"step_size.critic={trial.suggest_categorical('critic_lr', [1e-4, 3e-4, 1e-3])}",
-        f"lmbda={trial.suggest_categorical('lmbda', [0.8, 0.9, 0.95])}",
-        f"width={trial.suggest_categorical('width', [0.25, 0.5])}",
+CHOICES = {"8192": (32, 1024), "32768": (128, 4096), "131072": (512, 16_384)}
+"""The same for the hierarchical model, whose batches are eight times as large as ``training.frames_per_batch``."""
+
+KNOWN: tuple[dict[str, Any], ...] = (
+    {"batch": "default"},
+    {"batch": "large", "minibatches": 8, "passes": 4},
+)
+"""The first trials; settings that they leave out keep their defaults."""
+
+
+def suggest(trial: Any, method: str) -> list[str]:
+    """Return the settings of a trial, without those of its ``fixed_params`` that are the method's defaults."""
+    known = trial.user_attrs.get("known")
+    if known == "default":
+        return []
+    batches = CHOICES if method == "hierarchical" else BATCHES
+    if known == "large":
+        return batch_words(*list(batches.values())[-1], minibatches=8, passes=4)
+    chosen = batches[trial.suggest_categorical("batch", list(batches))]
+    words = batch_words(
+        *chosen,
+        minibatches=trial.suggest_categorical("minibatches", [8, 16]),
+        passes=trial.suggest_categorical("passes", [4, 8]),
+    )
+    words += [
+        f"step_size.target_kl={trial.suggest_categorical('target_kl', [0.02, 0.05, 0.1])}",
+        f"step_size.max={trial.suggest_categorical('max_step', [5e-4, 1e-3])}",
+        f"stage.gamma={trial.suggest_categorical('discount', [0.99, 0.995])}",
     ]
-    if method in ("mcp", "moe"):
-        exploration = trial.suggest_categorical("exploration", ["action", "weights"])
-        words.append(f"exploration={exploration}")
-        if exploration == "weights":
-            words.append(f"exploration.actor.logits_std={trial.suggest_categorical('logits_std', [0.25, 0.5, 1.0])}")
-    checkpoints = max(1, 4096 // (num_envs * horizon))
-    return [*words, f"checkpoint_interval={checkpoints}"]
+    return [*words, *NOISE[method][trial.suggest_categorical("noise", list(NOISE[method]))].split()]
 
 
-KNOWN = [  # the settings of preset=fast before the search, and small batches
-    {"num_envs": 128, "horizon": 32, "minibatch_size": 512, "num_epochs": 4, "lr": 3e-4, "max_lr": 5e-4,
-     "target_kl": 0.02, "critic_lr": 1e-3, "lmbda": 0.95, "width": 0.5, "exploration": "weights", "logits_std": 0.5},
-    {"num_envs": 32, "horizon": 32, "minibatch_size": 256, "num_epochs": 4, "lr": 3e-4, "max_lr": 5e-4,
-     "target_kl": 0.02, "critic_lr": 3e-4, "lmbda": 0.95, "width": 0.5, "exploration": "weights", "logits_std": 0.5},
-]  # fmt: skip
+def batch_words(num_envs: int, frames: int, *, minibatches: int, passes: int) -> list[str]:
+    """Return the settings of a batch."""
+    return [
+        f"training.num_envs={num_envs}",
+        f"training.frames_per_batch={frames}",
+        f"training.minibatch_size={frames // minibatches}",
+        f"training.num_epochs={passes}",
+    ]
+
+
+def _logits(exploration: str) -> dict[str, str]:
+    return {
+        "actions": "exploration=action",
+        "weights 0.5": "exploration=weights exploration.actor.logits_std=0.5",
+        "weights 1": "exploration=weights exploration.actor.logits_std=1",
+        "weights learned": "exploration=weights exploration.learned_logits_std=0.5",
+    }
+
+
+def _actions(stds: Sequence[float]) -> dict[str, str]:
+    return {
+        f"{std}{' learned' if learned else ''}": f"action_std={std} learned_std={str(learned).lower()}"
+        for std in stds
+        for learned in (False, True)
+    }
+
+
+NOISE = {
+    "mcp": _logits("weights"),
+    "moe": _logits("action"),
+    "latent_space": {
+        "actions": "exploration=action",
+        "latents 0.5": "exploration=weights exploration.latent_std=0.5",
+        "latents 1": "exploration=weights exploration.latent_std=1",
+        "latents learned": "exploration=weights",
+    },
+    "finetune": _actions([0.05, 0.1]),
+    "scratch": _actions([0.1, 0.2]),
+    "hierarchical": {"means": "exploration=weights", "samples": "exploration=action"},
+    "option_critic": {f"{share} random": f"epsilon={share}" for share in (0.05, 0.1, 0.2)},
+}
+"""What explores, and with how much noise, as settings by name."""
+
+
+class Training:
+    """A training in a process of its own, which is stopped between its stretches of CPU seconds."""
+
+    def __init__(self, words: Sequence[str], folder: Path) -> None:
+        self.folder = folder
+        shutil.rmtree(folder, ignore_errors=True)  # of an interrupted trial
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.log = folder.with_suffix(".log").open("w")
+        program = Path(sys.executable).with_name("torchrl-mcp-train")
+        self.command = [str(program), *words, *FIXED, f"run_dir={folder}"]
+        self.process = subprocess.Popen(self.command, stdout=self.log, stderr=self.log)
+        self.began = 0.0
+
+    def train_to(self, seconds: float) -> float:
+        """Train until this many CPU seconds in all, and return those taken.
+
+        Raises:
+            ChildProcessError: If the training ends by itself.
+        """
+        self.process.send_signal(signal.SIGCONT)
+        used = 0.0
+        while used < seconds:
+            time.sleep(1)
+            if self.process.poll() is not None:
+                raise ChildProcessError(f"{' '.join(self.command)} ended by itself, see {self.log.name}")
+            if not (self.folder / "config.yaml").exists():
+                self.began = cpu_seconds(self.process.pid)
+            used = cpu_seconds(self.process.pid) - self.began
+        self.process.send_signal(signal.SIGSTOP)
+        return used
+
+    def end(self) -> None:
+        """End the process, and remove the checkpoints."""
+        self.process.kill()
+        self.process.wait()
+        self.log.close()
 
 
 def cpu_seconds(pid: int) -> float:
@@ -79,151 +176,170 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def recent_return(folder: Path, share: float) -> float:
-    """Return the mean normalised return of the episodes that ended in the last ``share`` of the seconds, 0 if none did.
+def scored(training: Training, seconds: float) -> dict[str, Any]:
+    """Train until this many CPU seconds, evaluate the newest checkpoint, and return the numbers."""
+    used = training.train_to(seconds)
+    output = training.folder / f"search-{seconds:.0f}.json"
+    program = Path(sys.executable).with_name("torchrl-mcp-evaluate")
+    words = [program, training.folder, "--episodes", EPISODES, "--seed", EVALUATION_SEED, "--output", output]
+    subprocess.run([str(word) for word in words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    evaluation = json.loads(output.read_text())
+    row: dict[str, Any] = {"cpu_seconds": used}
+    for mode in ("deterministic", "stochastic"):
+        numbers = evaluation[mode]
+        row |= {
+            f"{mode}_return": round(numbers["normalised_return"], 4),
+            f"{mode}_success": numbers["metrics"].get("success"),
+            f"{mode}_success_seconds": round(numbers["durations"].get("success", 0) / 30, 3),
+            f"{mode}_falls": numbers["terminated"],
+        }
+    newest = max(training.folder.glob("checkpoints/checkpoint-*.torchrl"))
+    row["steps"] = int(newest.stem.removeprefix("checkpoint-"))
+    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in ("deterministic", "stochastic"))
+    return row
 
-    An iteration weighs as much as the episodes that end in it: else early falls would count most.
-    """
-    rows = read_metrics(folder)
-    late = [row for row in rows if row["seconds"] >= (1 - share) * rows[-1]["seconds"]]
-    late = [row for row in late if math.isfinite(row[NORMALISED_RETURN])]  # from the first episode of full length on
-    count = sum(row["episode/count"] for row in late)
-    return sum(row["episode/count"] * row[NORMALISED_RETURN] for row in late) / count if count else 0.0
+
+def settings_of(task: str, method: str) -> list[str]:
+    """Return the settings of all trials of a method in a task."""
+    pretrained = [] if method == "scratch" else [f"pretrained={PRETRAINED / f'{method}-biped-0.torchrl'}"]
+    return [f"task={task}", f"method={method}", *pretrained]
 
 
-def train(words: list[str], folder: Path, seconds: float, trial: optuna.Trial | None) -> float:
-    """Train for CPU seconds, and return those taken.
+def processor() -> str:
+    """Return the name of the processor."""
+    fields = dict(line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line)
+    names = {name.strip(): value.strip() for name, value in fields.items()}
+    family = f"family {names.get('cpu family')} model {names.get('model')}"
+    return f"{names.get('model name', platform.machine())} {family}"
 
-    Raises:
-        optuna.TrialPruned: If the run failed, or is worse than the others at half the time.
-    """
-    command = ["torchrl-mcp-train", *words, *FIXED, f"run_dir={folder}"]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (folder.parent / f"{folder.name}.log").open("w") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log)
-    began = used = 0.0
-    halfway = False
-    try:
-        while process.poll() is None:
-            time.sleep(1)
-            if not (folder / "config.yaml").exists():
-                began = cpu_seconds(process.pid)
-                continue
-            used = cpu_seconds(process.pid) - began
-            if trial and not halfway and used >= seconds / 2:
-                halfway = True
-                trial.report(recent_return(folder, 0.2), 1)
-                if trial.should_prune():
+
+def search(task: str, method: str, root: Path, *, seconds: float, trials: int) -> None:
+    """Search, and write a row for each run of each trial after each stretch."""
+    import optuna
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    name = f"{task}-{method}"
+    study = optuna.create_study(
+        study_name=name,
+        storage=JournalStorage(JournalFileBackend(str(root / "search.journal"))),
+        load_if_exists=True,
+        direction="maximize",
+        sampler=optuna.samplers.TPESampler(seed=SEEDS[0], multivariate=True, n_startup_trials=6),
+        pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0),
+    )
+    if not study.trials:
+        for known in ("default", "large"):
+            study.enqueue_trial({}, user_attrs={"known": known})
+    for trial in study.trials:
+        if trial.state == optuna.trial.TrialState.RUNNING:  # of an interrupted search
+            study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+            study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
+    table = Table(root / f"{name}.csv")
+
+    def objective(trial: Any) -> float:
+        own = suggest(trial, method)
+        score = 0.0
+        trainings: list[Training] = []
+        try:
+            for seed in SEEDS:
+                words = [*settings_of(task, method), f"seed={seed}", interval(own), *own]
+                trainings.append(Training(words, root / name / f"trial-{trial.number:02}-seed{seed}"))
+                table.write(trial.number, seed, own, scored(trainings[-1], seconds / 4))
+            for step, stretch in ((1, seconds / 4), (4, seconds)):
+                if step > 1:
+                    for seed, training in zip(SEEDS, trainings, strict=True):
+                        table.write(trial.number, seed, own, scored(training, stretch))
+                score = table.score(trial.number)
+                trial.report(score, step)
+                if step == 1 and trial.should_prune():
                     raise optuna.TrialPruned
-            if used >= seconds:
-                return used
-        raise optuna.TrialPruned(f"{command} ended by itself")
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        finally:
+            for training in trainings:
+                training.end()
+        return score
+
+    left = trials - sum(trial.state.name in ("COMPLETE", "PRUNED") for trial in study.trials)
+    study.optimize(objective, n_trials=max(0, left), catch=(ChildProcessError, subprocess.CalledProcessError))
 
 
-def score(folder: Path, seconds: float, words: list[str], trial: optuna.Trial | None = None) -> dict[str, float]:
-    """Train and evaluate."""
-    used = train(words, folder, seconds, trial)
-    output = folder / "search.json"
-    command = ["torchrl-mcp-evaluate", folder, "--episodes", "64", "--seed", "777", "--output", output]
-    subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    evaluated = json.loads(output.read_text())["deterministic"]["normalised_return"]
-    last = (read_metrics(folder) or [{"frames": 0.0}])[-1]
-    dead = [value for name, value in last.items() if name.startswith("dead")]
-    return {
-        "cpu_seconds": used,
-        "steps": last["frames"],
-        "training": recent_return(folder, 0.2),
-        "deterministic": evaluated,
-        "dead": max(dead, default=0.0),
-    }
+def interval(words: Sequence[str]) -> str:
+    """Return the setting of the checkpoints of a run with these settings, as seldom as all others' in steps."""
+    frames = next((int(word.partition("=")[2]) for word in words if "frames_per_batch" in word), 4096)
+    return f"checkpoint_interval={max(1, STEPS_PER_CHECKPOINT // frames)}"
 
 
-def main() -> None:
-    """Search."""
+def compare(
+    task: str, method: str, root: Path, candidates: dict[str, str], *, seconds: float, seeds: Sequence[int]
+) -> None:
+    """Train candidates to the end with every seed, and write a row for each run; rows that are there stay."""
+    table = Table(root / f"{task}-{method}-candidates.csv")
+    for seed in seeds:
+        for name, settings in candidates.items():
+            own = settings.split()
+            if table.holds(name, seed, own, seconds):
+                continue
+            words = [*settings_of(task, method), f"seed={seed}", interval(own), *own]
+            training = Training(words, root / f"{task}-{method}" / f"{name}-seed{seed}")
+            try:
+                table.write(name, seed, own, scored(training, seconds))
+            finally:
+                training.end()
+
+
+class Table:
+    """Rows of runs in a CSV file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows = list(csv.DictReader(path.open())) if path.exists() else []
+
+    def write(self, trial: int | str, seed: int, settings: Sequence[str], numbers: dict[str, Any]) -> None:
+        """Add a row, and write the file."""
+        row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings), "processor": processor()}
+        self.rows.append({name: str(value) for name, value in row.items()})
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(self.rows[0]))
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def score(self, trial: int) -> float:
+        """Return the mean score of a trial's seeds after its last stretch."""
+        newest = {row["seed"]: float(row["score"]) for row in self.rows if row["trial"] == str(trial)}
+        return mean(newest.values())
+
+    def holds(self, trial: str, seed: int, settings: Sequence[str], seconds: float) -> bool:
+        """Return whether there is a row of a run.
+
+        Raises:
+            SystemExit: If a row of the trial and seed has other settings or fewer CPU seconds.
+        """
+        rows = [row for row in self.rows if row["trial"] == trial and row["seed"] == str(seed)]
+        if any(row["settings"] != " ".join(settings) or float(row["cpu_seconds"]) < seconds for row in rows):
+            raise SystemExit(f"{self.path} has other settings or seconds of {trial}: remove the rows, or rename it")
+        return bool(rows)
+
+
+def main(argv: Sequence[str] | None = None, run: Callable[..., None] = search) -> None:
+    """Search, or compare candidates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task")
     parser.add_argument("method")
-    parser.add_argument("settings", nargs="*", help="of all trials")
-    parser.add_argument("--seconds", type=float, required=True, help="CPU seconds of a trial")
-    parser.add_argument("--trials", type=int, default=24)
+    parser.add_argument("--minutes", type=float, required=True, help="CPU minutes of a trial")
+    parser.add_argument("--trials", type=int, default=6)
     parser.add_argument("--candidate", action="append", default=[], metavar="NAME=SETTINGS", help="instead of a search")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[SEED], help="of candidates")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of candidates")
     parser.add_argument("--root", type=Path, default=Path("runs/search"))
-    arguments = parser.parse_args()
-    root = arguments.root / f"{arguments.task}-{arguments.method}"
-    root.mkdir(parents=True, exist_ok=True)
-    fixed = [f"task={arguments.task}", f"method={arguments.method}", *arguments.settings]
+    arguments = parser.parse_args(argv)
+    arguments.root.mkdir(parents=True, exist_ok=True)
+    place = (arguments.task, arguments.method, arguments.root)
+    seconds = 60 * arguments.minutes
     if arguments.candidate:
-        compare(root, fixed, dict(one.split("=", 1) for one in arguments.candidate), arguments.seeds, arguments.seconds)
-        return
-    fixed.append(f"seed={SEED}")
-
-    def objective(trial: optuna.Trial) -> float:
-        folder = root / f"trial-{trial.number:03}"
-        numbers = score(folder, arguments.seconds, [*fixed, *suggest(trial, arguments.method)], trial)
-        for name, value in numbers.items():
-            trial.set_user_attr(name, value)
-        for checkpoint in folder.glob("checkpoints/*"):
-            checkpoint.unlink()
-        return (numbers["training"] + numbers["deterministic"]) / 2
-
-    study = optuna.create_study(
-        study_name=root.name,
-        storage=JournalStorage(JournalFileBackend(str(arguments.root / "search.log"))),
-        load_if_exists=True,
-        direction="maximize",
-        sampler=optuna.samplers.TPESampler(seed=SEED, multivariate=True, group=True, n_startup_trials=10),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=4),
-    )
-    if not study.trials:
-        for settings in KNOWN:
-            study.enqueue_trial(settings)
-    done = sum(trial.state.is_finished() for trial in study.trials)
-    study.optimize(objective, n_trials=max(0, arguments.trials - done), catch=(subprocess.CalledProcessError,))
-    write(study, root.with_suffix(".csv"))
-
-
-def compare(root: Path, fixed: list[str], candidates: dict[str, str], seeds: list[int], seconds: float) -> None:
-    """Train and evaluate candidates with every seed, and write a row for each.
-
-    Raises:
-        SystemExit: If a candidate was scored with other seconds or settings.
-    """
-    table = []
-    for seed in seeds:
-        for name, settings in candidates.items():
-            folder = root / f"{name}-seed{seed}"
-            words = [*fixed, f"seed={seed}", "checkpoint_interval=4", *settings.split()]
-            asked = {"seconds": seconds, "settings": " ".join(words)}
-            if not (found := folder / "score.json").exists():
-                shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
-                found.write_text(json.dumps(score(folder, seconds, words) | asked))
-            held = json.loads(found.read_text())
-            if changed := [key for key, value in asked.items() if held.get(key) != value]:
-                raise SystemExit(
-                    f"{folder} was scored with other {' and '.join(changed)}: remove it, or give another --root"
-                )
-            table.append({"candidate": name, "seed": seed, **held})
-            write_rows(table, root.with_name(f"{root.name}-candidates.csv"))
-
-
-def write(study: optuna.Study, path: Path) -> None:
-    """Write the trials, best first."""
-    found = sorted(study.trials, key=lambda trial: -1 if trial.value is None else trial.value, reverse=True)
-    table = [{"trial": t.number, "state": t.state.name, "score": t.value, **t.user_attrs, **t.params} for t in found]
-    write_rows(table, path)
-
-
-def write_rows(table: list[dict], path: Path) -> None:
-    """Write a table as CSV."""
-    names = list(dict.fromkeys(name for row in table for name in row))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(table)
+        candidates = dict(one.split("=", 1) for one in arguments.candidate)
+        compare(*place, candidates, seconds=seconds, seeds=arguments.seeds)
+    else:
+        run(*place, seconds=seconds, trials=arguments.trials)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ class Evaluation:
             there on NaN.
         metrics: Other measurements of the task by name, ``(N,)``: for a flag such as ``success``, whether it was ever
             raised in the episode; for a number such as ``tracking_error``, its mean over the steps.
+        durations: Control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
         decisions: Recorded outputs of the policy, for all steps of all episodes, batch size ``(M,)``.
         reach: Returns of standing still and of an ideal player in the same episodes, if the task computes them.
     """
@@ -37,6 +38,7 @@ class Evaluation:
     terminated: Tensor
     positions: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
+    durations: dict[str, Tensor] = field(default_factory=dict)
     decisions: TensorDictBase = field(default_factory=TensorDict)
     reach: Reach | None = None
 
@@ -78,6 +80,7 @@ def evaluate(
     for key in names:
         kind = flags if env.observation_spec[key].dtype is torch.bool else sums
         kind[key] = torch.zeros_like(state[key])
+    raised_steps = {key: torch.zeros_like(flag, dtype=torch.int64) for key, flag in flags.items()}
     steps = getattr(env, "max_episode_steps", None)
     with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
         while running.any():
@@ -91,17 +94,26 @@ def evaluate(
             terminated |= running & outcome["terminated"].squeeze(-1)
             for key, raised in flags.items():
                 raised |= running.unsqueeze(-1) & outcome[key]
+                raised_steps[key] += running.unsqueeze(-1) & outcome[key]
             for key, total in sums.items():
                 total += outcome[key] * running.unsqueeze(-1)
             running &= ~outcome["done"].squeeze(-1)
             positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
     means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
-    metrics = {
-        name: value
-        for key, values in (flags | means).items()
-        for name, value in zip(names[key], values.unbind(-1), strict=True)
+    metrics = _by_name(flags | means, names)
+    durations = _by_name(raised_steps, names)
+    return Evaluation(
+        returns, lengths, terminated, torch.stack(positions), metrics, durations, torch.cat(decisions), reach
+    )
+
+
+def _by_name(values: dict[str, Tensor], names: dict[str, list[str]]) -> dict[str, Tensor]:
+    """Return the columns of values ``(N, E)`` by the names of their entries, ``(N,)`` each."""
+    return {
+        name: column
+        for key, columns in values.items()
+        for name, column in zip(names[key], columns.unbind(-1), strict=True)
     }
-    return Evaluation(returns, lengths, terminated, torch.stack(positions), metrics, torch.cat(decisions), reach)
 
 
 def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor]) -> dict[str, Any]:
@@ -113,7 +125,7 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``metrics``; if the task has it, ``reach``: the returns ``standing`` and ``ideal``, and the
+        fraction, ``metrics``, ``durations`` in control steps; if the task has it, ``reach``: the returns ``standing`` and ``ideal``, and the
         ``place``, 0 at the one and 1 at the other), the standard deviation over episodes (0 of a single one), and a
         95 % percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
     """
@@ -134,4 +146,5 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
         "terminated": outcome.terminated.float().mean().item(),
         "episodes": len(normalised),
         "metrics": {key: value.float().mean().item() for key, value in outcome.metrics.items()},
+        "durations": {key: value.float().mean().item() for key, value in outcome.durations.items()},
     }

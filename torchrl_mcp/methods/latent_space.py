@@ -42,6 +42,7 @@ from torchrl_mcp.methods.actor import (
     require_frozen,
     sampler,
 )
+from torchrl_mcp.methods.mcp import ConstantScale
 
 NOISE = ("latent", "noise")
 ENCODING = (("latent", "loc"), ("latent", "scale"))
@@ -94,7 +95,9 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
     return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
 
 
-def latents_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor:
+def latents_actor(
+    parts: nn.ModuleDict, *, latent_std: float | None = None, frozen: Collection[str] = ()
+) -> Actor:
     r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
 
     The policy gradient uses the density of the latent variable, as :func:`~torchrl_mcp.methods.mcp.weights_actor` uses
@@ -102,15 +105,18 @@ def latents_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Acto
 
     Args:
         parts: Made by :func:`latent_parts`.
+        latent_std: Standard deviation of the latent variable, or None for the encoder's.
         frozen: Names of the parts that do not change in training.
 
     Raises:
         ValueError: If the decoder is not frozen.
     """
     require_frozen("decoder", frozen, over="the latent variable")
+    fixed = () if latent_std is None else (TensorDictModule(ConstantScale(latent_std), [ENCODING[0]], list(ENCODING)),)
     encoder = (
         normalise_inputs(parts),
         TensorDictModule(parts["encoder"], in_keys=[STATE, GOAL], out_keys=list(ENCODING)),
+        *fixed,
         sampler("latents", IndependentNormal, loc=ENCODING[0], scale=ENCODING[1]),
     )
     decoder = TensorDictModule(parts["decoder"], in_keys=[STATE, "latents"], out_keys=["action", "_"])

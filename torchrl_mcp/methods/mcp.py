@@ -23,6 +23,7 @@ from torchrl_mcp.methods.actor import (
     require_frozen,
     sampler,
 )
+from torchrl_mcp.modules.gaussian import state_independent_scale
 from torchrl_mcp.modules.primitives import Primitives
 
 
@@ -35,8 +36,9 @@ def composite_parts(
     num_primitives: int,
     distribution_class: Composition,
     initial_std: float,
+    learned_logits_std: float | None = None,
 ) -> nn.ModuleDict:
-    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating`` and ``primitives``.
+    """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating``, ``primitives`` and ``gate_noise``.
 
     Args:
         sizes: Sizes of state, goal and action.
@@ -50,6 +52,8 @@ def composite_parts(
             whose deviation is proportional to that of their primitives, which squashed actions do not have. It includes
             the variance of each primitive and the variance between their means, and is a root mean square over
             normalised states and actions.
+        learned_logits_std: Standard deviation of the logits before training, for :func:`weights_actor` to learn it.
+            Without it there is no part ``gate_noise``.
 
     Raises:
         ValueError: If ``num_primitives`` is not positive, or weights are negative, not finite or all zero.
@@ -71,13 +75,10 @@ def composite_parts(
         weights = _valid(gate_activation(gate(states, goals)))
         composite = distribution_class(loc, scale, weights)
         networks.rescale(initial_std / composite.stddev.square().mean().sqrt().item())
-    return nn.ModuleDict(
-        {
-            **input_normalisers(sizes),
-            "gating": gate,
-            "primitives": networks,
-        }
-    )
+    parts = nn.ModuleDict({**input_normalisers(sizes), "gating": gate, "primitives": networks})
+    if learned_logits_std is not None:
+        parts["gate_noise"] = state_independent_scale(learned_logits_std, num_primitives, learned=True)
+    return parts
 
 
 def _valid(weights: Tensor) -> Tensor:
@@ -139,24 +140,25 @@ def weights_actor(
 ) -> Actor:
     r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
 
-    The gate's logits are Gaussian with a fixed standard deviation, and the policy gradient uses their density. So the
-    primitives have no gradient and must be frozen.
+    The gate's logits are Gaussian, and the policy gradient uses their density. So the primitives have no gradient and
+    must be frozen.
 
     Args:
         parts: Made by :func:`composite_parts`.
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
-        logits_std: Standard deviation of the logits.
+        logits_std: Standard deviation of the logits, unless the part ``gate_noise`` learns it.
         frozen: Names of the parts that do not change in training.
 
     Raises:
         ValueError: If the primitives are not frozen.
     """
     require_frozen("primitives", frozen, over="weights")
+    noise = parts["gate_noise"] if "gate_noise" in parts else ConstantScale(logits_std)
     gate = (
         normalise_inputs(parts),
         TensorDictModule(parts["gating"], in_keys=[STATE, GOAL], out_keys=["gate_loc"]),
-        TensorDictModule(ConstantScale(logits_std), in_keys=["gate_loc"], out_keys=["gate_scale"]),
+        TensorDictModule(noise, in_keys=["gate_loc"], out_keys=["gate_loc", "gate_scale"]),
     )
     normal = {"loc": "gate_loc", "scale": "gate_scale"}
     trained = ProbabilisticTensorDictSequential(*gate, sampler("gate_logits", IndependentNormal, **normal))
@@ -212,9 +214,9 @@ class ConstantScale(nn.Module):
             raise ValueError(f"logits_std must be positive, got {std}")
         self.std = std
 
-    def forward(self, loc: Tensor) -> Tensor:
-        """Return the standard deviation in the shape of ``loc``."""
-        return torch.full_like(loc, self.std)
+    def forward(self, loc: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``loc`` and the standard deviation in its shape."""
+        return loc, torch.full_like(loc, self.std)
 
 
 class DeterministicAction(nn.Module):
