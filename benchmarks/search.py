@@ -46,8 +46,10 @@ EPISODES = "128"
 
 PRETRAINED = Path(__file__).parent / "results" / "table2" / "networks"
 
-FIXED = ("character=biped", "stage=transfer", "autocast=false", "logger=none", "progress_bar=false", "torch_threads=1",
-         "num_threads=1", "keep_checkpoints=1", "evaluation.episodes=0", "training.total_frames=1_000_000_000")  # fmt: skip
+FIXED = (
+    *("character=biped", "stage=transfer", "autocast=false", "logger=none", "progress_bar=false", "torch_threads=1"),
+    *("num_threads=1", "keep_checkpoints=1", "evaluation.episodes=0", "training.total_frames=1_000_000_000"),
+)
 
 STEPS_PER_CHECKPOINT = 65_536
 
@@ -59,15 +61,9 @@ BATCHES = {"1024": (32, 1024), "4096": (128, 4096), "16384": (512, 16_384)}
 CHOICES = {"8192": (32, 1024), "32768": (128, 4096), "131072": (512, 16_384)}
 """The same for the hierarchical model, whose batches are eight times as large as ``training.frames_per_batch``."""
 
-KNOWN: tuple[dict[str, Any], ...] = (
-    {"batch": "default"},
-    {"batch": "large", "minibatches": 8, "passes": 4},
-)
-"""The first trials; settings that they leave out keep their defaults."""
-
 
 def suggest(trial: Any, method: str) -> list[str]:
-    """Return the settings of a trial, without those of its ``fixed_params`` that are the method's defaults."""
+    """Return the settings of a trial; the first two, which are known, are not proposed by the sampler."""
     known = trial.user_attrs.get("known")
     if known == "default":
         return []
@@ -98,7 +94,7 @@ def batch_words(num_envs: int, frames: int, *, minibatches: int, passes: int) ->
     ]
 
 
-def _logits(exploration: str) -> dict[str, str]:
+def _logits() -> dict[str, str]:
     return {
         "actions": "exploration=action",
         "weights 0.5": "exploration=weights exploration.actor.logits_std=0.5",
@@ -116,8 +112,8 @@ def _actions(stds: Sequence[float]) -> dict[str, str]:
 
 
 NOISE = {
-    "mcp": _logits("weights"),
-    "moe": _logits("action"),
+    "mcp": _logits(),
+    "moe": _logits(),
     "latent_space": {
         "actions": "exploration=action",
         "latents 0.5": "exploration=weights exploration.latent_std=0.5",
@@ -195,7 +191,8 @@ def scored(training: Training, seconds: float) -> dict[str, Any]:
         }
     newest = max(training.folder.glob("checkpoints/checkpoint-*.torchrl"))
     row["steps"] = int(newest.stem.removeprefix("checkpoint-"))
-    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in ("deterministic", "stochastic"))
+    modes = ("deterministic", "stochastic")
+    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in modes)
     return row
 
 

@@ -3,12 +3,10 @@
 import csv
 import importlib
 import importlib.util
-import json
 import runpy
 import sys
 from itertools import product
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -17,6 +15,7 @@ from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.configuration import compose_run
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ABOUT = {"commit", "date", "processor", "instructions", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
@@ -193,61 +192,35 @@ def test_learners_are_drawn_that_have_rows(monkeypatch):
 
 @pytest.fixture
 def search(monkeypatch):
-    """The search of settings, without Optuna, which comparisons of candidates do not need."""
-    for name in ("optuna", "optuna.storages", "optuna.storages.journal"):
-        monkeypatch.setitem(sys.modules, name, MagicMock())
+    """The search of settings, which needs Optuna only to propose them."""
     monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.delitem(sys.modules, "search", raising=False)
     return importlib.import_module("search")
 
 
-def test_candidates_are_scored_once_from_an_empty_folder_and_have_a_table_of_their_own(search, tmp_path, monkeypatch):
-    scored = []
-
-    def score(folder, seconds, words):
-        assert not folder.exists()
-        folder.mkdir()
-        scored.append(folder.name)
-        return {"cpu_seconds": seconds + 0.5}
-
-    monkeypatch.setattr(search, "score", score)
-    (tmp_path / "heading-mcp/small-seed7").mkdir(parents=True)
-    (tmp_path / "heading-mcp/small-seed7/config.yaml").touch()  # of an interrupted run
-    (tmp_path / "heading-mcp.csv").write_text("trials")
+def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_again(search, tmp_path, monkeypatch):
+    tiny = "preset=smoke training.frames_per_batch=128 task.evaluation.max_episode_steps=10"
+    monkeypatch.setattr(search, "EPISODES", "4")
+    monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
+    words = ["heading", "scratch", "--minutes", "0.01", "--seeds", "7", "--candidate", f"tiny={tiny}"]
     for _ in range(2):
-        search.compare(tmp_path / "heading-mcp", ["task=heading"], {"small": "width=0.1"}, [7], 90.0)
-    assert scored == ["small-seed7"]
-    with (tmp_path / "heading-mcp-candidates.csv").open(newline="") as file:
+        search.main([*words, "--root", str(tmp_path)])
+    with (tmp_path / "heading-scratch-candidates.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
-    assert row["seconds"] == "90.0"
-    assert {"task=heading", "seed=7", "width=0.1"} < set(row["settings"].split())
-    assert (tmp_path / "heading-mcp.csv").read_text() == "trials"
+    assert (row["trial"], row["seed"], row["settings"]) == ("tiny", "7", tiny)
+    assert float(row["cpu_seconds"]) >= 0.6
+    assert int(row["steps"]) > 0
+    returns = [float(row[f"{mode}_return"]) for mode in ("deterministic", "stochastic")]
+    assert float(row["score"]) == pytest.approx(sum(returns) / 2)
+    with pytest.raises(SystemExit, match="tiny"):
+        search.main([*words[:3], "1", *words[4:], "--root", str(tmp_path)])
 
 
-@pytest.mark.parametrize(
-    ("settings", "seconds", "named"),
-    [("width=0.1", 900.0, "seconds"), ("width=0.2", 90.0, "settings"), ("width=0.2", 900.0, "seconds and settings")],
-)
-def test_a_score_of_other_seconds_or_settings_is_not_taken(search, tmp_path, monkeypatch, settings, seconds, named):
-    monkeypatch.setattr(search, "score", lambda folder, *_: folder.mkdir(parents=True) or {"cpu_seconds": 90.5})
-    search.compare(tmp_path, [], {"small": "width=0.1"}, [7], 90.0)
-    with pytest.raises(
-        SystemExit, match=f"small-seed7 was scored with other {named}: remove it, or give another --root"
-    ):
-        search.compare(tmp_path, [], {"small": settings}, [7], seconds)
-
-
-def test_a_search_weighs_episodes_of_full_length_alone_and_goes_on_without_any(search, tmp_path, monkeypatch):
-    assert search.recent_return(tmp_path, 0.2) == 0.0
-    header = "frames,seconds,episode/count,episode/normalised_return\n"
-    (tmp_path / "metrics.csv").write_text(header + "10,1,5,0.9\n20,9,7,nan\n30,9.5,1,0.2\n40,10,3,0.6\n")
-    assert search.recent_return(tmp_path, 0.2) == pytest.approx((1 * 0.2 + 3 * 0.6) / 4)
-    (tmp_path / "metrics.csv").unlink()  # all time has passed before the first iteration
-    (tmp_path / "search.json").write_text(json.dumps({"deterministic": {"normalised_return": 0.1}}))
-    monkeypatch.setattr(search, "train", lambda *_: 90.0)
-    monkeypatch.setattr(search.subprocess, "run", lambda *_, **__: None)
-    found = search.score(tmp_path, 90.0, [])
-    assert (found["steps"], found["training"], found["deterministic"]) == (0.0, 0.0, 0.1)
+def test_every_method_is_searched_over_settings_that_it_has(search):
+    for method, noises in search.NOISE.items():
+        for settings in noises.values():
+            words = [*search.settings_of("dribble", method), *search.FIXED, *settings.split()]
+            compose_run(*words, *search.batch_words(32, 1024, minibatches=8, passes=4), "stage.gamma=0.995")
 
 
 def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):

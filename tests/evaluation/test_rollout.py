@@ -166,6 +166,20 @@ class Measured(Countdown):
         return super()._emit(done, success=elapsed == 2, steps=steps, **kwargs)
 
 
+class Lasting(Measured):
+    """The same, but the flag stays raised."""
+
+    def _emit(self, done, **kwargs):
+        return super()._emit(done, **kwargs).set("success", self.elapsed.unsqueeze(-1) >= 2)
+
+
+def test_the_duration_of_a_flag_is_counted_in_steps_of_the_episode():
+    assert evaluate(IDLE, Measured([1, 2, 5])).durations["success"].tolist() == [0, 1, 1]
+    outcome = evaluate(IDLE, Lasting([1, 2, 5]))
+    assert outcome.durations["success"].tolist() == [0, 1, 4]
+    assert episode_statistics(outcome, lambda returns: returns)["durations"] == pytest.approx({"success": 5 / 3})
+
+
 def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
     outcome = evaluate(IDLE, Measured([1, 2, 5]))
     assert outcome.metrics["success"].tolist() == [False, True, True]

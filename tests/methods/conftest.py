@@ -27,7 +27,7 @@ def sizes():
 def composite(sizes):
     """Small parts of a composite."""
 
-    def composite(*, gate_activation, distribution_class, num_primitives=4, gain=1.0, initial_std=0.3):
+    def composite(*, gate_activation, distribution_class, num_primitives=4, gain=1.0, initial_std=0.3, **settings):
         return composite_parts(
             sizes,
             gating=partial(GATING, output_gain=gain),
@@ -36,6 +36,7 @@ def composite(sizes):
             num_primitives=num_primitives,
             distribution_class=distribution_class,
             initial_std=initial_std,
+            **settings,
         )
 
     return composite

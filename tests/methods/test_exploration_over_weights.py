@@ -37,6 +37,20 @@ def test_exploration_over_weights_scores_the_gate_s_logits(make_actor, sample):
     assert all(parameter.grad is None for parameter in parts["primitives"].parameters())
 
 
+def test_the_noise_of_the_logits_can_be_learned(composite, states):
+    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+    parts = composite(**heads, learned_logits_std=0.4)
+    actor = weights_actor(parts, **heads, logits_std=0.2, frozen=["primitives"])
+    with torch.no_grad():
+        stored = actor.policy(states(50))
+    torch.testing.assert_close(stored["gate_scale"], torch.full((50, 4), 0.4))
+    # Where the logits are far from their mean, a wider Gaussian makes them likelier.
+    stored["gate_logits"] = stored["gate_loc"] + 2.0
+    actor.trained.get_dist(stored).log_prob(stored["gate_logits"]).sum().backward()
+    (log_std,) = parts["gate_noise"].parameters()
+    torch.testing.assert_close(log_std.grad, torch.full((4,), 50 * ((2.0 / 0.4) ** 2 - 1)))
+
+
 @pytest.mark.parametrize("frozen", [(), ("observation_normaliser",)])
 def test_exploration_over_weights_refuses_primitives_that_are_not_frozen(frozen, composite):
     heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}

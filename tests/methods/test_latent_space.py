@@ -130,6 +130,16 @@ def test_exploration_over_the_latent_variable_draws_it_and_plays_the_decoder_s_m
     assert torch.equal(played["latents"], played["latent", "loc"])
 
 
+def test_the_noise_of_the_latent_variable_can_be_fixed():
+    frozen = ["decoder", "observation_normaliser"]
+    parts = make(frozen=frozen)[1]
+    actor = latents_actor(parts, latent_std=0.7, frozen=frozen)
+    with torch.no_grad():
+        stored = actor.policy(states(20))
+    score = Independent(Normal(stored["latent", "loc"], 0.7), 1).log_prob(stored["latents"])
+    torch.testing.assert_close(stored["latents_log_prob"], score)
+
+
 def test_exploration_over_the_latent_variable_refuses_a_decoder_that_is_not_frozen():
     with pytest.raises(ValueError, match=r"decoder.*transfer\.freeze.*exploration=action"):
         latents_actor(make()[1])

@@ -4,8 +4,8 @@
 
 A trained policy in a loop with physics is chaotic: a rounding of the last bit gives other trajectories after a second.
 So the tests that are marked with ``trajectories`` have bounds from distributions. This command runs them with the
-kernels of other processors, with more threads, in bfloat16, with other seeds, and, as the surest stand-in for a processor
-that is not at hand, with first observations that differ by a relative 1e-7, with twenty seeds.
+kernels of other processors, with more threads, in bfloat16, with other seeds, and with first observations that differ
+by a relative 1e-7: twenty of these perturbations are the surest stand-in for a processor that is not at hand.
 """
 
 import os

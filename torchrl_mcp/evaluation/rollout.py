@@ -125,9 +125,10 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
 
     Returns:
         Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``metrics``, ``durations`` in control steps; if the task has it, ``reach``: the returns ``standing`` and ``ideal``, and the
-        ``place``, 0 at the one and 1 at the other), the standard deviation over episodes (0 of a single one), and a
-        95 % percentile bootstrap ``interval`` of the mean of the normalised return (of no width for a single episode).
+        fraction, ``metrics``, ``durations`` of flags in control steps; if the task has it, ``reach``: the returns
+        ``standing`` and ``ideal``, and the ``place``, 0 at the one and 1 at the other), the standard deviation over
+        episodes (0 of a single one), and a 95 % percentile bootstrap ``interval`` of the mean of the normalised return
+        (of no width for a single episode).
     """
     normalised = normalised_return(outcome.returns)
     estimate = mean(normalised.tolist())

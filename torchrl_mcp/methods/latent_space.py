@@ -95,9 +95,7 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
     return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
 
 
-def latents_actor(
-    parts: nn.ModuleDict, *, latent_std: float | None = None, frozen: Collection[str] = ()
-) -> Actor:
+def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, frozen: Collection[str] = ()) -> Actor:
     r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
 
     The policy gradient uses the density of the latent variable, as :func:`~torchrl_mcp.methods.mcp.weights_actor` uses
