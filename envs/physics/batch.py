@@ -56,6 +56,8 @@ class BatchSimulation(Simulation):
         self._initial, self._before = self._batch.state[0].copy(), np.empty_like(self._rows)
         sensors = ["sensordata"] if model.nsensordata else []
         self.outputs = {name: _view(self._batch.bind(name)) for name in (*outputs, *sensors)}
+        self._num_contacts = self._batch.bind("ncon")
+        self._num_constraints = self._batch.bind("nefc")
 
     def step(self, ctrl: Tensor) -> Tensor:
         """See :meth:`Simulation.step`."""
@@ -112,7 +114,7 @@ class BatchSimulation(Simulation):
         return self._data
 
     def _run(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> np.ndarray:
-        """Call MuJoCo, add the time, and return the simulations in which it raised an error."""
+        """Call MuJoCo, add the time, and return the simulations in which it raised an error or dropped constraints."""
         if os.getpid() != self._process:  # MuJoCo would wait forever for threads that a fork does not copy
             raise RuntimeError(
                 f"process {os.getpid()} inherited this environment by a fork from process {self._process}, without its "
@@ -125,8 +127,26 @@ class BatchSimulation(Simulation):
             return error.ids
         finally:
             self.physics_seconds += time.perf_counter() - start
-        return _NOBODY
+        return self._short_of_memory()
 
+    def _short_of_memory(self) -> np.ndarray:
+        """Return the simulations in which MuJoCo dropped all constraints because the arena was full.
+
+        From MuJoCo 4 on this is a warning, before it is an error. Contacts without any constraint are its sign, which
+        contacts in the gap of two geoms share. ``MjData.warning`` tells them apart, but copying it is slow.
+        """
+        suspects = np.flatnonzero((self._num_contacts > 0) & (self._num_constraints == 0))
+        if not len(suspects):
+            return _NOBODY
+        dropped = []
+        for index in suspects:
+            self._batch.get_data(index, self._data)
+            if any(self._data.warning[kind].number for kind in _ARENA_WARNINGS):
+                dropped.append(index)
+        return np.array(dropped, dtype=np.int64)
+
+
+_ARENA_WARNINGS = (int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL))
 
 _NOBODY = np.empty(0, dtype=np.int64)
 

@@ -13,6 +13,9 @@ import mujoco
 PLATFORMS = ("egl", "osmesa", "glfw")
 """Values of ``MUJOCO_GL`` on Linux in the order of trial: a GPU's driver, the processor, a display."""
 
+PYOPENGL = "PYOPENGL_PLATFORM"
+"""Variable that a desktop session may set for other programs, and that MuJoCo sets where it is not set."""
+
 PROBE = """
 import mujoco
 context = mujoco.GLContext(8, 8)
@@ -56,10 +59,11 @@ def _platform() -> Callable[[int, int], GLContext] | None:
         return None if found is None else mujoco.GLContext
     # MuJoCo chose its own class on import, but looks up OpenGL's functions when it first draws.
     os.environ["MUJOCO_GL"] = found
+    os.environ.pop(PYOPENGL, None)  # MuJoCo refuses another value than its own
     return import_module(f"mujoco.{found}").GLContext
 
 
 def _works(platform: str) -> bool:
     """Try a platform in a separate process: a failure may end the process, and PyOpenGL keeps its first platform."""
-    environment = {**os.environ, "MUJOCO_GL": platform}
+    environment = {name: value for name, value in os.environ.items() if name != PYOPENGL} | {"MUJOCO_GL": platform}
     return subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True).returncode == 0

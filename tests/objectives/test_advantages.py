@@ -105,6 +105,14 @@ def test_they_follow_the_definition(outcomes, seed, gamma, lmbda, clip):
         torch.testing.assert_close(batch[key].squeeze(-1), torch.tensor(numbers), atol=2e-4, rtol=1e-4, msg=key)
 
 
+def test_an_end_that_is_marked_by_done_alone_does_not_see_the_next_episode():
+    batch = trajectories([[CONTINUES, TRUNCATED, CONTINUES, CONTINUES]], seed=0)
+    expected = Advantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)(batch.clone())["value_target"]
+    batch["next", "truncated"] = torch.zeros_like(batch["next", "truncated"])
+    found = Advantages(critic(), gamma=0.9, lmbda=0.8, clip=4.0)(batch)["value_target"]
+    torch.testing.assert_close(found, expected)
+
+
 @pytest.mark.parametrize("position", [2, 4], ids=["within the batch", "at its end"])
 def test_a_time_limit_is_bootstrapped_from_the_state_it_cut_off_and_a_termination_is_not(position):
     outcomes = [[CONTINUES] * 5]

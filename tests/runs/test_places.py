@@ -150,9 +150,10 @@ def test_a_stored_configuration_has_no_place_but_absolute_ones(begun):
     assert str(begun) not in text
 
 
-def test_the_path_of_a_class_is_no_place():
-    config = {"made": {"_target_": "hydra.utils.get_class", "path": "torch.nn.Linear"}, "pretrained": "builtin"}
+@pytest.mark.parametrize("function", ["hydra.utils.get_class", "hydra.utils.get_method", "own_module.mixer"])
+def test_only_the_path_of_a_folder_of_motions_is_a_place(function):
+    config = {"made": {"_target_": function, "path": "torch.nn.Linear"}, "pretrained": "builtin"}
     assert places.outside(config) == {}
     assert places.stored(OmegaConf.create(config)) == {**config, "run_dir": ".", "run_root": "."}
-    relative = OmegaConf.create({"motions": {"path": "clips"}})
-    assert places.stored(relative)["motions"]["path"] == str(Path("clips").absolute())
+    motions = {"_target_": "torchrl_mcp.envs.motions.corpus.folder_library", "path": "clips"}
+    assert places.stored(OmegaConf.create({"motions": motions}))["motions"]["path"] == str(Path("clips").absolute())

@@ -78,8 +78,9 @@ class ScaledGAE:
 def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[TensorDictBase], Tensor]) -> Tensor:
     """Return values of the states in which the steps of trajectories end, ``(*B, T, F)``.
 
-    They are those of the following samples. After a time limit and at the end of the batch, no sample of the same
-    episode follows, and the stored next state is evaluated. After a terminated episode they have no meaning.
+    They are those of the following samples. After the end of an episode that is not terminated, such as a time limit,
+    and at the end of the batch, no sample of the same episode follows, and the stored next state is evaluated. After a
+    terminated episode they have no meaning.
 
     Args:
         values: Values of the states in which the steps begin, ``(*B, T, F)``.
@@ -87,7 +88,7 @@ def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[Tens
         evaluate: From states ``(M,)`` to values ``(M, F)``.
     """
     after = batch["next"]
-    cut = after.get("truncated", after["done"] & ~after["terminated"]).squeeze(-1).clone()
+    cut = (after["done"] & ~after["terminated"]).squeeze(-1)  # not "truncated", which own transforms may leave out
     cut[..., -1] = True
     arrived = values.roll(-1, dims=-2)
     arrived[cut] = evaluate(after[cut])

@@ -13,7 +13,6 @@ from zipfile import ZipFile, is_zipfile
 
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_mcp.runs.trust import GET_CLASS
 from torchrl_mcp.training.run_folder import find_all
 
 HERE = "."
@@ -21,7 +20,10 @@ HERE = "."
 
 PRETRAINED = "pretrained"
 NAMES = (PRETRAINED, "path")
-"""Names of settings whose value is a file or folder outside the run folder, in any group."""
+"""Names of settings whose value is a file or folder outside the run folder."""
+
+FOLDER_LIBRARY = "torchrl_mcp.envs.motions.corpus.folder_library"
+"""The function whose argument ``path`` is a folder; ``path`` of others may be anything."""
 
 BUILTIN = "builtin"
 """Value of ``pretrained``, or its beginning, for the networks that come with the library."""
@@ -30,7 +32,7 @@ BUILTIN = "builtin"
 def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield the name and value of every setting that is a file or folder.
 
-    >>> list(settings({"seed": 0, "pretrained": "runs/a", "motions": {"path": "clips"}}))
+    >>> list(settings({"seed": 0, "pretrained": "runs/a", "motions": {"_target_": FOLDER_LIBRARY, "path": "clips"}}))
     [('pretrained', 'runs/a'), ('motions.path', 'clips')]
     """
     if isinstance(config, list):
@@ -40,7 +42,9 @@ def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
         for key, value in config.items():
             if not isinstance(value, str):
                 yield from settings(value, f"{prefix}{key}.")
-            elif key in NAMES and value.partition(":")[0] != BUILTIN and config.get("_target_") != GET_CLASS:
+            elif (key == PRETRAINED and value.partition(":")[0] != BUILTIN) or (
+                key == "path" and config.get("_target_") == FOLDER_LIBRARY
+            ):
                 yield f"{prefix}{key}", value
 
 

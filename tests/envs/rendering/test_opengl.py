@@ -31,6 +31,25 @@ def test_the_first_platform_that_works_is_taken_and_the_others_are_not_tried(tri
     assert os.environ["MUJOCO_GL"] == "osmesa"  # from where MuJoCo loads OpenGL's functions
 
 
+@linux
+def test_a_platform_that_the_desktop_chose_for_other_programs_hinders_no_probe(monkeypatch):
+    environments = []
+
+    def probe(command, *, env, capture_output):
+        environments.append(env)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(opengl.subprocess, "run", probe)
+    monkeypatch.setattr(opengl, "import_module", lambda name: SimpleNamespace(GLContext=lambda width, height: name))
+    monkeypatch.setenv("MUJOCO_GL", "")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "x11")
+    opengl._platform.cache_clear()
+    assert opengl.new_context(8, 8) == "mujoco.egl"
+    opengl._platform.cache_clear()
+    assert environments[0]["MUJOCO_GL"] == "egl"
+    assert "PYOPENGL_PLATFORM" not in {**environments[0], **os.environ}
+
+
 def test_what_the_environment_asks_for_is_the_only_one_tried(tried, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     tried.working.add("osmesa")
