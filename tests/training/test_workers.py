@@ -9,7 +9,7 @@ import time
 import pytest
 
 from torchrl_mcp.runs.processes import start
-from torchrl_mcp.training.workers import attend, end, new_workers
+from torchrl_mcp.training.workers import attend, begun, end, new_workers
 
 COMMAND = """
 import multiprocessing, time
@@ -21,6 +21,21 @@ if __name__ == "__main__":
     time.sleep(60)
 """
 """A command line that imports what ``torchrl-mcp-train`` does, with a worker that sleeps in place of its imports."""
+
+
+FAILING = """
+import multiprocessing
+
+from torchrl_mcp.envs import Heading
+
+
+class Failing(Heading):
+    def __init__(self, *arguments, **settings):
+        if multiprocessing.parent_process() is not None:
+            raise RuntimeError("no room for another world")
+        super().__init__(*arguments, **settings)
+"""
+"""A task that works in the main process and fails in a worker."""
 
 
 def for_ever():
@@ -51,6 +66,50 @@ def test_a_task_that_waits_for_a_dead_worker_is_given_up_within_seconds_and_the_
         end(workers)
     assert time.monotonic() - began < 10
     assert not set(workers) & set(multiprocessing.active_children())
+
+
+def test_a_start_whose_worker_dies_without_a_word_is_given_up_within_seconds():
+    def starting():
+        start(time.sleep, 60.0).kill()
+        for_ever()
+
+    began = time.monotonic()
+    with pytest.raises(ChildProcessError, match="SIGKILL"), new_workers():
+        begun(starting)
+    assert time.monotonic() - began < 20
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (RuntimeError("the reason"), ChildProcessError),
+        (KeyError("the reason"), ChildProcessError),
+        (MemoryError("the reason"), ChildProcessError),
+        (ValueError("the reason"), ValueError),
+    ],
+)
+def test_a_start_that_fails_says_why_in_an_error_that_commands_explain(error, raised):
+    def starting():
+        raise error
+
+    with pytest.raises(raised, match="the reason"):
+        begun(starting)
+    assert begun(lambda: 3) == 3
+
+
+def test_a_training_whose_workers_fail_while_they_start_ends_with_the_reason_in_one_line(tmp_path):
+    (tmp_path / "failing.py").write_text(FAILING)
+    (tmp_path / "own/task").mkdir(parents=True)
+    task = "defaults: [heading, _self_]\nname: failing\ntransfer: {_target_: failing.Failing}\n"
+    (tmp_path / "own/task/failing.yaml").write_text(task)
+    settings = ["task=failing", "method=scratch", "preset=smoke", "logger=none", "run_dir=run"]
+    settings += ["collector=processes", "collector.num_workers=2"]
+    command = [sys.executable, "-m", "torchrl_mcp.cli.train", "--config-dir", "own", *settings]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "no room for another world" in line]
+    assert "worker" in line
 
 
 def test_workers_of_a_start_that_fails_are_ended_and_others_are_left_alone():

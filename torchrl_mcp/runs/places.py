@@ -42,10 +42,14 @@ def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
         for key, value in config.items():
             if not isinstance(value, str):
                 yield from settings(value, f"{prefix}{key}.")
-            elif (key == PRETRAINED and value.partition(":")[0] != BUILTIN) or (
-                key == "path" and config.get("_target_") == FOLDER_LIBRARY
-            ):
+            elif _is_place(key, value, config):
                 yield f"{prefix}{key}", value
+
+
+def _is_place(key: str, value: str, config: Mapping[str, Any]) -> bool:
+    if key == PRETRAINED:
+        return value.partition(":")[0] != BUILTIN
+    return key == "path" and config.get("_target_") == FOLDER_LIBRARY
 
 
 def outside(config: Mapping[str, Any]) -> dict[str, str]:

@@ -13,13 +13,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.training import ray_agents
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads, threads_kept
-from torchrl_mcp.training.workers import attend, end, end_with_parent, new_workers
+from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
 
 Environments = CharacterEnv | TransformedCharacterEnv
 
@@ -207,20 +208,29 @@ class RemoteSource:
         self._watched = ExitStack()
         if self._backend["backend"] == "ray":
             self._watched.enter_context(ray_agents.watched())
+        make_collector = partial(
+            Collector,
+            [partial(self._make_env, seed=int(seed)) for seed in seeds],
+            _Autocast(policy, batches.device) if batches.autocast else policy,
+            num_collectors=self.num_workers,
+            sync=True,
+            frames_per_batch=batches.frames,
+            total_frames=batches.frames * 10**9,  # not all backends support endless collection
+            env_device="cpu",
+            policy_device=batches.device,
+            storing_device=batches.device,
+            **self._backend,
+        )
+        weights = SharedMemWeightSyncScheme()
+        if self._backend["backend"] == "process":
+            make_collector = partial(make_collector, weight_sync_schemes={"policy": weights})
         # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
-        with threads_kept(), new_workers() as self._workers:
-            self._collector = Collector(
-                [partial(self._make_env, seed=int(seed)) for seed in seeds],
-                _Autocast(policy, batches.device) if batches.autocast else policy,
-                num_collectors=self.num_workers,
-                sync=True,
-                frames_per_batch=batches.frames,
-                total_frames=batches.frames * 10**9,  # not all backends support endless collection
-                env_device="cpu",
-                policy_device=batches.device,
-                storing_device=batches.device,
-                **self._backend,
-            )
+        try:
+            with threads_kept(), new_workers() as self._workers:
+                self._collector = begun(make_collector)
+        except BaseException:
+            weights.shutdown()  # at the interpreter's exit it would wait for ever for a thread that cannot start
+            raise
         GlobalRNGState().load_state_dict(random)
         self._batches: Iterator[TensorDictBase] | None = None
 

@@ -17,6 +17,9 @@ Result = TypeVar("Result")
 INTERVAL = 0.5
 """Seconds between checks of the workers."""
 
+PATIENCE = 5.0
+"""Seconds for the reason of a worker that has ended to arrive."""
+
 
 def attend(task: Callable[[], Result], workers: Sequence[BaseProcess]) -> Result:
     """Return the result of ``task``, which waits for ``workers``, or fail as soon as one of them ends.
@@ -36,6 +39,37 @@ def attend(task: Callable[[], Result], workers: Sequence[BaseProcess]) -> Result
     if outcome.exception():
         _require_alive(workers)
     return outcome.result()
+
+
+def begun(start: Callable[[], Result]) -> Result:
+    """Return the result of ``start``, which starts workers, or fail as soon as one of them fails or ends.
+
+    Raises:
+        ChildProcessError: If a worker ends, or fails with another error than those below.
+        OSError: Of a worker or of ``start``.
+        ValueError: Likewise.
+    """
+    others = set(multiprocessing.active_children())
+    outcome: Future[Result] = Future()
+    thread = threading.Thread(target=_fulfil, args=(outcome, start), daemon=True)
+    thread.start()
+    workers: list[BaseProcess] = []
+    while thread.is_alive():
+        thread.join(INTERVAL / 5)
+        workers += [process for process in _started_beside(others) if process not in workers]
+        try:
+            _require_alive(workers)
+        except ChildProcessError:
+            thread.join(PATIENCE)  # a worker that fails says why before it ends
+            if not outcome.done():
+                raise
+    error = outcome.exception()
+    if error is None or isinstance(error, (OSError, ValueError)):
+        return outcome.result()
+    if not isinstance(error, Exception):
+        raise error
+    lines = str(error).strip().splitlines() or [type(error).__name__]  # TorchRL passes on the worker's whole traceback
+    raise ChildProcessError(f"a worker failed while it started: {lines[-1]}") from error
 
 
 @contextmanager
