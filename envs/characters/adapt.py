@@ -247,8 +247,9 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
     for geom in _touching(model):
         kind = mujoco.mjtGeom(model.geom_type[geom])
         if kind not in KINDS and model.geom_bodyid[geom] in names:
-            shape, body = model.geom(geom).name or "a shape without a name", names[model.geom_bodyid[geom]]
-            raise ValueError(f"{shape} of the body {body} is a {kind.name} that collides: draw capsules or boxes")
+            shape = model.geom(geom).name or "a shape without a name"
+            owner = names[model.geom_bodyid[geom]]
+            raise ValueError(f"{shape} of the body {owner} is a {kind.name} that collides: draw capsules or boxes")
 
 
 def _touching(model: mujoco.MjModel) -> set[int]:

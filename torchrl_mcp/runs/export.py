@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.interface import interface
 from torchrl_mcp.training.run_folder import replacing
@@ -58,7 +59,11 @@ def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Ten
     _, agent, env = policies.restore(path, num_envs=num, seed=0)
     state = env.reset()
     policy = DeterministicPolicy(agent.actor.policy).eval()
-    return policy, (state["observation"], state["goal"]), interface(getattr(env, "base_env", env))
+    return (
+        policy,
+        (state["observation"], state["goal"]),
+        interface(env.base_env if isinstance(env, TransformedCharacterEnv) else env),
+    )
 
 
 def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> ExportedProgram:
