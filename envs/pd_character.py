@@ -105,6 +105,8 @@ class PDCharacterEnv(CharacterEnv):
                 "divided by a whole number, such as 1/120"
             )
         model = spec.compile()
+        self.scene = spec.to_xml()
+        """MJCF of the character in its scene."""
         super().__init__(
             model,
             num_envs,

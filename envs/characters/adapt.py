@@ -11,17 +11,30 @@ from torchrl_mcp.envs.characters.contract import (
     FREE,
     HINGE,
     colliding,
+    guessed_feet,
     joints_of,
     kinds_of,
     line_of,
     lowest_bodies,
 )
-from torchrl_mcp.envs.characters.drives import TIMESTEP, Drive, drive, load, matched
+from torchrl_mcp.envs.characters.drives import (
+    PASSIVE,
+    TIMESTEP,
+    Drive,
+    drive,
+    driven_joints,
+    load,
+    matched,
+    passive_drive,
+)
+from torchrl_mcp.envs.characters.omissions import omissions
 from torchrl_mcp.envs.characters.pose import FREE_RANGE, Pose
 from torchrl_mcp.envs.characters.sides import Sides, guessed_sides
 
 BEYOND = 1.2
 """Factor on the limits of a joint that defines the range of its targets."""
+
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 
 LEAST_INERTIA = 1e-10
 """Moment of inertia in kg m^2 below which MuJoCo writes 0."""
@@ -36,6 +49,28 @@ KINDS = {
 """The shape that replaces each shape."""
 
 
+def float_trunk(spec: mujoco.MjSpec, name: str | None = None) -> None:
+    """Give the trunk of a file a free joint, so that MuJoCo does not merge it into the world.
+
+    Args:
+        spec: The file, not compiled.
+        name: The trunk, or None for the body on the world with the most bodies.
+
+    Raises:
+        ValueError: If no such body hangs on the world, or it has joints.
+    """
+    candidates = {body.name: body for body in spec.worldbody.bodies}
+    if not candidates:
+        raise ValueError("--floating needs a body in the file, which has none: name a file with bodies")
+    if name is None:
+        name = max(candidates, key=lambda candidate: len(candidates[candidate].find_all("body")))
+    if name not in candidates:
+        raise ValueError(f"--floating: {name} does not hang on the world: name one of {', '.join(candidates)} (--root)")
+    if candidates[name].joints:
+        raise ValueError(f"--floating: {name} already has a joint: leave the option out, or name another --root")
+    candidates[name].add_freejoint()
+
+
 class Adapted(NamedTuple):
     """A body that was made a character.
 
@@ -46,7 +81,7 @@ class Adapted(NamedTuple):
         sides: Beginnings or ends of bodies' names, right and left.
         drives: Drive of the joint of each body, by name.
         ranges: Range of each of these joints in radians; of a ball joint its greatest angle.
-        left_out: Other bodies that hang on the world of the file.
+        left_out: Names of the parts of the file that are left out, by kind.
     """
 
     spec: mujoco.MjSpec
@@ -55,7 +90,7 @@ class Adapted(NamedTuple):
     sides: Sides
     drives: Mapping[str, Drive]
     ranges: Mapping[str, tuple[float, float]]
-    left_out: tuple[str, ...]
+    left_out: Mapping[str, Sequence[str]]
 
 
 def adapted(
@@ -73,7 +108,8 @@ def adapted(
     Floor, lights, cameras, tendons, equality constraints and sensors are left out, and shapes that do not collide if
     they are meshes; cylinders become capsules and ellipsoids boxes. Several hinges of a body become a ball joint, whose
     targets have the ranges of the hinges about each axis. Each joint gets a position servo, see
-    :func:`~torchrl_mcp.envs.characters.drives.drive`. The body is put on the ground. Masses, inertias, gravity
+    :func:`~torchrl_mcp.envs.characters.drives.drive`; if the file has actuators, a joint on which none of them acts
+    stays passive, unless ``torques`` names it. The body is put on the ground. Masses, inertias, gravity
     compensation, ranges of hinges, and damping, stiffness and friction loss of joints stay the same.
 
     Args:
@@ -81,7 +117,8 @@ def adapted(
         root: Body that carries all others, or None for the one with the most bodies. It gets a free joint if it has
             no joint.
         pose: Rest pose, see :meth:`~torchrl_mcp.envs.characters.pose.Pose.read`; empty for that of the file.
-        feet: Bodies that may touch the ground, or None for the lowest in the rest pose.
+        feet: Bodies that may touch the ground, or None for those of
+            :func:`~torchrl_mcp.envs.characters.contract.guessed_feet`.
         sides: Beginnings or ends of bodies' names, right and left, or None for the usual ones that occur.
         torques: Limits of torques in N m, by regular expressions that are found in names of joints or bodies.
         gains: Gains in N m/rad, likewise.
@@ -97,22 +134,24 @@ def adapted(
     _require_convertible(model, names)
     rest = Pose.read(model, pose, list(names))
     spec = _standing(model, names, rest)
-    soles = _feet(feet, lowest_bodies(spec.compile())[1], names)
+    sides = guessed_sides(names.values()) if sides is None else sides
+    soles = _feet(feet, spec.compile(), sides, names)
     jointed = {body: name for body, name in names.items() if body != trunk and joints_of(model, body)}
-    drives = _drives(spec.compile(), model, jointed, soles, torques or {}, gains or {})
+    drives = _drives(spec.compile(), model, jointed, soles, rest, torques or {}, gains or {})
     for body, name in jointed.items():
         joint, own = spec.joint(name), drives[name]
         joint.damping[0], joint.stiffness[0] = own.passive, own.spring
         joint.armature, joint.frictionloss = own.armature, own.friction
-        _add_servos(spec, name, own, _ranges(model, body, rest))
+        if own.torque_from != PASSIVE:
+            _add_servos(spec, name, own, _ranges(model, body, rest))
     return Adapted(
         spec,
         names[trunk],
         soles,
-        guessed_sides(names.values()) if sides is None else sides,
+        sides,
         drives,
         {name: (spec.joint(name).range[0], spec.joint(name).range[1]) for name in drives},
-        tuple(model.body(body).name for body in _roots(model) if body not in line_of(model, trunk)),
+        omissions(spec.compile(), model, list(names)),
     )
 
 
@@ -146,6 +185,7 @@ def _drives(
     model: mujoco.MjModel,
     jointed: Mapping[int, str],
     feet: Sequence[str],
+    rest: Pose,
     torques: Mapping[str, float],
     gains: Mapping[str, float],
 ) -> dict[str, Drive]:
@@ -155,10 +195,15 @@ def _drives(
     }
     torque, gain = matched(torques, known, "--torque"), matched(gains, known, "--gain")
     soles = [posed.body(foot).id for foot in feet]
-    return {
-        name: drive(model, body, load(posed, posed.body(name).id, soles), torque.get(body), gain.get(body))
-        for body, name in jointed.items()
-    }
+    driven = driven_joints(model, rest.data.qpos)
+    drives = {}
+    for body, name in jointed.items():
+        if body not in torque and driven.isdisjoint(joints_of(model, body)):
+            drives[name] = passive_drive(model, body)
+            continue
+        needed = load(posed, posed.body(name).id, soles)
+        drives[name] = drive(model, body, needed, torque.get(body), gain.get(body))
+    return drives
 
 
 def key_bodies(model: mujoco.MjModel) -> list[str]:
@@ -186,7 +231,14 @@ def _root(model: mujoco.MjModel, name: str | None) -> int:
 
 def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> None:
     trunk, *others = names
-    if kinds_of(model, trunk) not in ([], [FREE]):
+    hanging = [body for body in _roots(model) if kinds_of(model, body) not in ([], [FREE])]
+    if trunk in hanging and (len(hanging) > 1 or any(model.geom_type[model.geom_bodyid == 0] != PLANE)):
+        raise ValueError(
+            f"{', '.join(model.body(body).name for body in hanging)} hang on the world by joints, because the trunk of "
+            "the file is fixed and part of the world: pass --floating, or let a joint of type floating connect a link "
+            "called world with the base of the URDF"
+        )
+    if trunk in hanging:
         raise ValueError(f"the root {names[trunk]} has joints other than a free joint: replace them by a freejoint")
     for body in others:
         kinds = kinds_of(model, body)
@@ -195,7 +247,9 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
     for geom in _touching(model):
         kind = mujoco.mjtGeom(model.geom_type[geom])
         if kind not in KINDS and model.geom_bodyid[geom] in names:
-            raise ValueError(f"{model.geom(geom).name or geom} is a {kind.name} that collides: draw capsules or boxes")
+            shape = model.geom(geom).name or "a shape without a name"
+            owner = names[model.geom_bodyid[geom]]
+            raise ValueError(f"{shape} of the body {owner} is a {kind.name} that collides: draw capsules or boxes")
 
 
 def _touching(model: mujoco.MjModel) -> set[int]:
@@ -213,18 +267,20 @@ def _possible(inertia: np.ndarray) -> np.ndarray:
     return inertia
 
 
-def _feet(given: Sequence[str] | None, lowest: Sequence[str], names: Mapping[int, str]) -> tuple[str, ...]:
+def _feet(
+    given: Sequence[str] | None, posed: mujoco.MjModel, sides: Sides, names: Mapping[int, str]
+) -> tuple[str, ...]:
     every = list(names.values())
     if given is not None:
         if unknown := [name for name in given if name not in every]:
             raise ValueError(f"there is no body {', '.join(unknown)} for the feet: name some of {', '.join(every)}")
         return tuple(given)
-    if every[0] in lowest:
+    if every[0] in lowest_bodies(posed)[1]:
         raise ValueError(
             f"{every[0]}, the root, is lowest in the rest pose: choose one that stands on feet, such as --pose "
             "KEYFRAME or --pose knee=-1.2, or name the feet (--feet)"
         )
-    return tuple(lowest)
+    return tuple(guessed_feet(posed, sides))
 
 
 def _add_joint(target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: int, rest: Pose) -> None:

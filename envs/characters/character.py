@@ -18,7 +18,8 @@ class Character:
     Its MJCF file holds the body alone, without floor, light or task, standing in its rest pose: x forward, y left, z
     up, soles on z = 0. The root has a free joint; every other body has one joint of its own name, ball or hinge, or is
     welded to its parent. A hinge has one ``position`` actuator of that name, a ball joint three, ``<name>_x``, ``_y``
-    and ``_z``, which together are PD control of the exponential map. Shapes are spheres, capsules and boxes with
+    and ``_z``, which together are PD control of the exponential map; a joint without actuators is passive, and so is
+    its twin on the other side. Shapes are spheres, capsules and boxes with
     ``contype=0 conaffinity=1``: they collide with a scene whose shapes have ``contype=1``, not with one another.
 
     Args:

@@ -21,6 +21,12 @@ CONTROL_TIMESTEP = 1 / 30
 FREE, BALL, HINGE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE)
 )
+FOOT_HEIGHT = 0.03
+"""Largest height of a foot above the lowest point of the rest pose, in heights of the root above that point."""
+
+LIMB_FEET = 2
+"""Largest number of feet on a line of bodies, such as heel and toes."""
+
 SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
 
 
@@ -69,7 +75,7 @@ def violations(
         *_defaults(spec),
         *_root(model),
         *_joints(model),
-        *_actuators(model),
+        *_actuators(model, sides),
         *_shapes(model),
         *_rest(model),
         *_names(model, named, sides),
@@ -83,12 +89,10 @@ def violations(
     return found
 
 
-def lowest_bodies(model: mujoco.MjModel, *, within: float = 0.03) -> tuple[float, list[str]]:
+def lowest_bodies(model: mujoco.MjModel) -> tuple[float, list[str]]:
     """Return the height of the lowest point in the rest pose, in metres, and the bodies close to it.
 
-    Args:
-        model: The body.
-        within: Largest height above the lowest point, in metres.
+    A body is close if its height above the lowest point is at most :data:`FOOT_HEIGHT` times that of the root.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -96,7 +100,28 @@ def lowest_bodies(model: mujoco.MjModel, *, within: float = 0.03) -> tuple[float
     if not heights:
         return 0.0, []
     lowest = min(height for height, _ in heights)
-    return lowest, list(dict.fromkeys(name for height, name in heights if height < lowest + within))
+    highest = lowest + FOOT_HEIGHT * max(float(data.xpos[1, 2]) - lowest, 0.0)
+    return lowest, list(dict.fromkeys(name for height, name in heights if height <= highest))
+
+
+def guessed_feet(model: mujoco.MjModel, sides: Sides = ()) -> list[str]:
+    """Return the bodies that are probably feet: the lowest in the rest pose, at the ends of limbs.
+
+    On each line from the root, the outermost :data:`LIMB_FEET` bodies are feet. If some of them have a twin on the
+    other side, the others, such as a tail, are not feet.
+
+    Args:
+        model: The body.
+        sides: Beginnings or ends of bodies' names, right and left.
+    """
+    lowest = lowest_bodies(model)[1]
+    lines = {name: {model.body(body).name for body in line_of(model, model.body(name).id)} for name in lowest}
+    beyond = {name: [other for other in lowest if other != name and name in lines[other]] for name in lowest}
+    depth = {
+        name: 1 + max((len(lines[other] & {*beyond[name]}) for other in beyond[name]), default=0) for name in lowest
+    }
+    feet = [name for name in lowest if depth[name] <= LIMB_FEET]
+    return [name for name in feet if twin(name, sides) != name and twin(name, sides) in feet] or feet
 
 
 def colliding(model: mujoco.MjModel) -> list[int]:
@@ -181,12 +206,24 @@ def _holds_rest(model: mujoco.MjModel, hinge: int) -> bool:
     return not model.jnt_limited[hinge] or bool(low <= model.qpos0[model.jnt_qposadr[hinge]] <= high)
 
 
-def _actuators(model: mujoco.MjModel) -> Iterator[Violation]:
+def passive_bodies(model: mujoco.MjModel) -> list[str]:
+    """Return the bodies whose joints have no actuator."""
+    driven = set(model.actuator_trnid[:, 0].tolist())
+    jointed = [body for body in range(2, model.nbody) if joints_of(model, body)]
+    return [model.body(body).name for body in jointed if driven.isdisjoint(joints_of(model, body))]
+
+
+def _actuators(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
     expected = [name for body in range(2, model.nbody) for name in _controls(model, body)]
     there = [model.actuator(index).name for index in range(model.nu)]
-    if missing := [name for name in expected if name not in there]:
+    passive = passive_bodies(model)
+    same_on_both_sides = {body for body in passive if body and model.nu and twin(body, sides) in passive}
+    spared = {name for body in same_on_both_sides for name in _controls(model, model.body(body).id)}
+    if missing := [name for name in expected if name not in there and name not in spared]:
         yield Violation(
-            f"lacks the actuators {', '.join(missing)}", "give each hinge one of its name, a ball _x, _y, _z"
+            f"lacks the actuators {', '.join(missing)}",
+            "give each hinge one of its name, a ball _x, _y, _z; only joints of both sides, or of the middle, may be "
+            "passive",
         )
     if spare := [name or "unnamed" for name in there if name not in expected]:
         yield Violation(

@@ -28,7 +28,7 @@ LEAST = 0.005
 LEAST_APART = 1e-3
 """Distance in metres of a hinge's anchor from the mean of its body's above which it is told of."""
 
-FILE, GIVEN, GUESSED = "file", "given", "guessed"
+FILE, GIVEN, GUESSED, PASSIVE = "file", "given", "guessed", "passive"
 
 
 class Drive(NamedTuple):
@@ -36,7 +36,7 @@ class Drive(NamedTuple):
 
     Args:
         torque: Limit of the torque, in N m; of several hinges the largest.
-        torque_from: ``"file"``, ``"given"`` or ``"guessed"``.
+        torque_from: ``"file"``, ``"given"``, ``"guessed"``, or ``"passive"`` for a joint without a motor.
         limits: Limits of the torques about x, y and z; of a single hinge they are the same.
         gain: Stiffness kp of the servo, in N m/rad.
         gain_from: As ``torque_from``.
@@ -101,6 +101,49 @@ def motor(model: mujoco.MjModel, joint: int) -> Motor:
         limit = float(abs(model.jnt_actfrcrange[joint]).max())
         torque = min(torque, limit) if torque else limit
     return Motor(torque, gain, damping)
+
+
+def driven_joints(model: mujoco.MjModel, qpos: np.ndarray) -> set[int]:
+    """Return the joints on which actuators act, directly or through tendons; all joints if there is no actuator.
+
+    Args:
+        model: The body.
+        qpos: The rest pose, shape ``(nq,)``.
+    """
+    if not model.nu:
+        return set(range(model.njnt))
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    moments = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    adheres = model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY
+    return set(model.dof_jntid[moments[~adheres].any(0)].tolist())
+
+
+def passive_drive(model: mujoco.MjModel, body: int) -> Drive:
+    """Return the drive of a joint without a motor: damping, armature, friction and spring of its file.
+
+    Args:
+        model: The body as its file describes it.
+        body: The body that the joint moves.
+    """
+    joints = joints_of(model, body)
+    dofs = np.flatnonzero(np.isin(model.dof_jntid, joints))
+    armature = float(model.dof_armature[dofs].max())
+    return Drive(
+        torque=0.0,
+        torque_from=PASSIVE,
+        limits=(),
+        gain=0.0,
+        gain_from=PASSIVE,
+        damping=0.0,
+        passive=float(model.dof_damping[dofs].max()),
+        armature=armature,
+        friction=float(model.dof_frictionloss[dofs].max()),
+        spring=float(model.jnt_stiffness[joints].max()),
+        remark=", ".join(_remarks(model, joints, [0.0], armature, armature)),
+    )
 
 
 class Load(NamedTuple):

@@ -116,8 +116,8 @@ def _put_within(model: mujoco.MjModel, data: mujoco.MjData, hinges: Sequence[int
             beyond.append((model.joint(hinge).name, low, high))
     if beyond:
         shown = ", ".join(f"{name} ({low:.3g} to {high:.3g})" for name, low, high in beyond)
-        name, low, high = beyond[0]
+        example = " ".join(f"{name}={(low + high) / 2:.2f}" for name, low, high in beyond)
         raise ValueError(
             f"the rest pose is beyond the range in radians of {shown}: choose one within it, such as --pose KEYFRAME "
-            f"or --pose {name}={(low + high) / 2:.2f}"
+            f"or --pose {example}"
         )

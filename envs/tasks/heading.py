@@ -1,6 +1,7 @@
 """The heading task: walk in a direction that keeps changing, also at changing speeds."""
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -85,6 +86,14 @@ class Heading(PDCharacterEnv):
         )
         self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
         self.make_specs()
+
+    goal_units = MappingProxyType({"direction": "unit vector", "speed": "m/s"})
+    """Units of the entries of ``goal``."""
+
+    @property
+    def goal_sizes(self) -> dict[str, int]:
+        """Numbers of values of the first entries of ``goal``, by name."""
+        return {"direction": 2, "speed": 1} if self.changes_speed else {"direction": 2}
 
     @property
     def changes_speed(self) -> bool:

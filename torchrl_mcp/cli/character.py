@@ -40,9 +40,12 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, "Check whether an MJCF file is a character, or make one of it.", EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("file", type=Path, metavar="FILE.xml", help="MJCF")
+    shared.add_argument("file", type=Path, metavar="FILE", help="MJCF or URDF")
     shared.add_argument(
-        "--feet", nargs="+", metavar="BODY", help="bodies that may touch the ground (default: the lowest)"
+        "--feet",
+        nargs="+",
+        metavar="BODY",
+        help="bodies that may touch the ground (default: the lowest, at the ends of limbs)",
     )
 
     shared.add_argument(
@@ -61,6 +64,9 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--name", type=_name, required=True, help="name of the character and of its files")
     command.add_argument("--output", type=Path, default=Path(), help="folder to write to (default here)")
     command.add_argument("--root", metavar="BODY", help="body that carries the others (default: the most others)")
+    command.add_argument(
+        "--floating", action="store_true", help="give the trunk a free joint, such as that of a URDF with a fixed base"
+    )
     command.add_argument(
         "--pose", nargs="+", default=[], metavar="POSE", help="rest pose: a keyframe, and PATTERN=RADIANS of hinges"
     )

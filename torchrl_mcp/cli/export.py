@@ -31,12 +31,12 @@ def main() -> None:
     from torchrl_mcp.runs.trust import trusting
 
     with trusting(arguments.trust):
-        policy, states = export.example(path)
+        policy, states, metadata = export.example(path)
     if arguments.torch:
         export.write_torch(policy, states, arguments.torch)
         print(arguments.torch)
     if arguments.onnx:
-        difference = export.write_onnx(policy, states, arguments.onnx)
+        difference = export.write_onnx(policy, states, arguments.onnx, metadata)
         checked = "not checked: onnxruntime is not installed"
         print(arguments.onnx, checked if difference is None else f"differs from torch by at most {difference:.0e}")
 

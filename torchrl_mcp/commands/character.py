@@ -12,9 +12,9 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import mujoco
 
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.characters.adapt import Adapted, adapted, key_bodies
-from torchrl_mcp.envs.characters.contract import Violation, lowest_bodies, violations
-from torchrl_mcp.envs.characters.drives import GUESSED, Drive
+from torchrl_mcp.envs.characters.adapt import Adapted, adapted, float_trunk, key_bodies
+from torchrl_mcp.envs.characters.contract import Violation, guessed_feet, passive_bodies, violations
+from torchrl_mcp.envs.characters.drives import GUESSED, PASSIVE, Drive
 from torchrl_mcp.envs.characters.sides import SIDES, Sides, guessed_sides
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import replacing
@@ -51,10 +51,13 @@ def check(arguments: argparse.Namespace) -> int:
     """Print each violation of the contract; return the exit status."""
     spec = _spec(mujoco.MjSpec.from_file, str(arguments.file), arguments.file)
     model = spec.compile()
-    feet, sides = _feet(model, arguments.feet), _sides(model, arguments.sides)
+    sides = _sides(model, arguments.sides)
+    feet = arguments.feet or guessed_feet(model, sides)
     found = violations(spec, feet=feet, sides=sides)
     _print(found)
     print(_verdict(arguments.file, found, feet))
+    if passive := passive_bodies(model):
+        print(f"passive, because they have no actuator: {', '.join(passive)}")
     return bool(found)
 
 
@@ -65,11 +68,10 @@ def adapt(arguments: argparse.Namespace) -> int:
         ValueError: If MuJoCo cannot read the file or what was made of it, a file to write is there already, or the name
             is of another character or module.
     """
-    name, folder, source = (
-        arguments.name,
-        arguments.output,
-        _spec(mujoco.MjSpec.from_file, str(arguments.file), arguments.file).compile(),
-    )
+    name, folder = arguments.name, arguments.output
+    source = _spec(
+        mujoco.MjSpec.from_file, str(arguments.file), arguments.file, arguments.floating, arguments.root
+    ).compile()
     body = adapted(
         source,
         root=arguments.root,
@@ -95,7 +97,7 @@ def adapt(arguments: argparse.Namespace) -> int:
             folder / "own" / "character" / f"{name}.yaml": CONFIG.format(name=name),
         }
     )
-    print(*_description(body, source, arguments.pose), sep="\n")
+    print(*_description(body, source, arguments), sep="\n")
     found = violations(written, feet=body.feet, key_bodies=ends, sides=body.sides)
     _print(found)
     print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.3g} kg. Next:")
@@ -115,19 +117,27 @@ def _require_unused(name: str, folder: Path) -> None:
         raise ValueError(f"{name} is the name of {owner}: choose another (--name)")
 
 
-def _description(body: Adapted, source: mujoco.MjModel, pose: Sequence[str]) -> Iterator[str]:
-    """Yield what was found and chosen, and a table of the joints."""
-    yield f"root: {body.root}" + (f" (left out: {', '.join(body.left_out)})" if body.left_out else "")
-    yield f"pose: {' '.join(pose) or 'as in the file'}"
-    yield f"feet: {', '.join(body.feet)}"
-    yield f"sides: {' '.join(f'{right}:{left}' for right, left in body.sides) or 'none found'}"
-    if source.neq:
-        yield f"left out: {source.neq} equality constraints, which may close chains or couple joints"
+def _description(body: Adapted, source: mujoco.MjModel, arguments: argparse.Namespace) -> Iterator[str]:
+    """Yield what was found and chosen, and tables of the joints and of what is left out."""
+    yield f"root: {body.root}{'' if arguments.root else ' (guessed: give another with --root)'}"
+    yield f"pose: {' '.join(arguments.pose) or 'as in the file'}"
+    yield f"feet: {', '.join(body.feet)}{'' if arguments.feet else ' (guessed: name others with --feet)'}"
+    sides = " ".join(f"{right}:{left}" for right, left in body.sides) or "none found"
+    yield f"sides: {sides}{'' if arguments.sides else ' (guessed: give others with --sides)'}"
     gravity = float(abs(source.opt.gravity).max())
     if gravity and abs(gravity / GRAVITY - 1) > 0.1:
         yield f"units: gravity is {gravity:.4g} in the file, so its lengths are not in metres; they are taken as metres"
     yield ""
     yield text_table([_row(name, drive, body.ranges[name]) for name, drive in body.drives.items()])
+    if body.left_out:
+        yield ""
+        rows = [
+            {"left out": kind, "number": str(len(names)), "names": ", ".join(names)}
+            for kind, names in body.left_out.items()
+        ]
+        yield text_table(rows)
+    if passive := [name for name, drive in body.drives.items() if drive.torque_from == PASSIVE]:
+        yield f"{', '.join(passive)} stay passive: no actuator of the file acts on them, and --torque gives them one"
     guesses = sum([drive.torque_from, drive.gain_from].count(GUESSED) for drive in body.drives.values())
     if guesses:
         yield f"{guesses} values are guessed from the weights: give those of the maker with --torque and --gain"
@@ -139,22 +149,29 @@ def _row(name: str, drive: Drive, limits: tuple[float, float]) -> dict[str, str]
     return {
         "joint": name,
         "range rad": f"{low:.3g} to {high:.3g}",
-        "torque N m": f"{drive.torque:.3g} {drive.torque_from}",
-        "gain N m/rad": f"{drive.gain:.3g} {drive.gain_from}",
+        "torque N m": PASSIVE if drive.torque_from == PASSIVE else f"{drive.torque:.3g} {drive.torque_from}",
+        "gain N m/rad": PASSIVE if drive.gain_from == PASSIVE else f"{drive.gain:.3g} {drive.gain_from}",
         "damping N m s/rad": f"{drive.damping:.3g} + {drive.passive:.3g}",
         "armature kg m2": f"{drive.armature:.3g}",
         "": ", ".join([*(f"{key} {value:.3g}" for key, value in kept.items() if value), *filter(None, [drive.remark])]),
     }
 
 
-def _spec(read: Callable[[str], mujoco.MjSpec], source: str, what: object) -> mujoco.MjSpec:
-    """Read MJCF from a file or a text, and compile it.
+def _spec(
+    read: Callable[[str], mujoco.MjSpec], source: str, what: object, floating: bool = False, trunk: str | None = None
+) -> mujoco.MjSpec:
+    """Read MJCF or a URDF from a file or a text, give its trunk a free joint if it is ``floating``, and compile it.
 
     Raises:
         ValueError: If MuJoCo cannot.
     """
     try:
         spec = read(source)
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {what}: {error}") from error
+    if floating:
+        float_trunk(spec, trunk)
+    try:
         spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {what}: {error}") from error
@@ -175,10 +192,6 @@ def _write(written: dict[Path, str]) -> None:
 def _print(found: Sequence[Violation]) -> None:
     for violation in found:
         print(f"- {violation}")
-
-
-def _feet(model: mujoco.MjModel, named: Sequence[str] | None) -> list[str]:
-    return list(named) if named else lowest_bodies(model)[1]
 
 
 def _sides(model: mujoco.MjModel, given: Sequence[tuple[str, str]] | None) -> Sides:

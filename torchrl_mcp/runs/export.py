@@ -1,7 +1,9 @@
 """Deterministic policies for other programs: ONNX, and ``torch.export``."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -10,7 +12,9 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import policies
+from torchrl_mcp.runs.interface import interface
 from torchrl_mcp.training.run_folder import replacing
 
 INPUTS = ("observation", "goal")
@@ -42,8 +46,8 @@ class DeterministicPolicy(nn.Module):
             return self.policy(state)["action"]
 
 
-def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor]]:
-    """Return the policy of a run, and observations and goals for it, ``(num, S)`` and ``(num, G)``.
+def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor], dict[str, str]]:
+    """Return the policy of a run, observations and goals for it, ``(num, S)`` and ``(num, G)``, and its interface.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
@@ -54,7 +58,12 @@ def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Ten
     """
     _, agent, env = policies.restore(path, num_envs=num, seed=0)
     state = env.reset()
-    return DeterministicPolicy(agent.actor.policy).eval(), (state["observation"], state["goal"])
+    policy = DeterministicPolicy(agent.actor.policy).eval()
+    return (
+        policy,
+        (state["observation"], state["goal"]),
+        interface(env.base_env if isinstance(env, TransformedCharacterEnv) else env),
+    )
 
 
 def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> ExportedProgram:
@@ -75,8 +84,18 @@ def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path
         torch.export.save(export(policy, states), file)
 
 
-def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:
+def write_onnx(
+    policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path, metadata: Mapping[str, str]
+) -> float | None:
     """Write a policy as ONNX, inputs ``observation`` and ``goal``, output ``action``; check it if onnxruntime is there.
+
+    The first dimension of each is called ``batch``.
+
+    Args:
+        policy: The policy.
+        states: Observations and goals for tracing, at least two.
+        path: The file to write.
+        metadata: Metadata of the file, see :func:`~torchrl_mcp.runs.interface.interface`.
 
     Returns:
         The largest difference from torch's actions in ``states``, or None without onnxruntime.
@@ -85,6 +104,7 @@ def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path:
         ValueError: If onnx or onnxscript is not installed.
     """
     try:
+        import onnx
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise ValueError(f"{path} needs onnx and onnxscript: pip install 'torchrl-mcp[onnx]'") from error
@@ -98,7 +118,20 @@ def write_onnx(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path:
             external_data=False,
             verbose=False,
         )
+        model = onnx.load(partial)
+        _name_batch(model.graph)
+        onnx.helper.set_model_props(model, dict(metadata))
+        onnx.save(model, partial)
     return onnx_difference(policy, states, path)
+
+
+def _name_batch(graph: Any) -> None:
+    """Call the first dimension of a graph's inputs ``batch``, wherever it occurs."""
+    traced = graph.input[0].type.tensor_type.shape.dim[0].dim_param
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        for dim in value.type.tensor_type.shape.dim:
+            if dim.dim_param == traced:
+                dim.dim_param = "batch"
 
 
 def onnx_difference(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:

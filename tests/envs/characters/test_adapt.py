@@ -10,7 +10,7 @@ import torch
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS, Character
-from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, key_bodies
+from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, float_trunk, key_bodies
 from torchrl_mcp.envs.characters.contract import lowest_bodies, violations
 from torchrl_mcp.envs.characters.drives import LIMIT_ANGLE
 from torchrl_mcp.envs.characters.sides import guessed_sides, twin
@@ -272,7 +272,7 @@ def test_a_pose_that_is_none_is_refused(pose, message):
         adapted(robot(), pose=pose)
 
 
-BALL = '<body name="ball" pos="2 0 1"><freejoint/><geom size="0.1"/></body>'
+BALL = '<body name="ball" pos="2 0 1"><freejoint/><geom name="ball_shape" size="0.1"/></body>'
 
 
 def test_the_root_is_the_body_that_carries_most_or_the_one_that_is_named():
@@ -281,7 +281,7 @@ def test_the_root_is_the_body_that_carries_most_or_the_one_that_is_named():
         ROBOT.format(**PLAIN | {"scenery": BALL}).replace('"3 2 1', '"2 0 1 1 0 0 0 3 2 1')
     )
     body = adapted(model)
-    assert (body.root, body.left_out) == ("trunk", ("ball",))
+    assert (body.root, body.left_out) == ("trunk", {"body": ["ball"], "shape": ["ball_shape"], "keyframe": ["crouch"]})
     assert adapted(model, root="trunk").root == "trunk"
     with pytest.raises(ValueError, match="there is no body chest for the root: name one of ball, trunk, right_thigh"):
         adapted(model, root="chest")
@@ -353,3 +353,132 @@ def test_a_twin_is_the_same_part_on_the_other_side():
     sides = (("FR_", "FL_"), ("_R", "_L"))
     names = ["FR_calf", "FL_calf", "toe_R", "toe_L", "trunk"]
     assert [twin(name, sides) for name in names] == ["FL_calf", "FR_calf", "toe_L", "toe_R", "trunk"]
+
+
+TENDONS = """<tendon><fixed name="right_pull"><joint joint="right_knee" coef="1"/></fixed></tendon>
+<equality><joint name="coupled" joint1="left_knee" joint2="right_knee"/></equality>
+<sensor><jointpos name="angle" joint="left_knee"/></sensor>"""
+
+
+def with_tendon(actuators):
+    text = ROBOT.format(**PLAIN | {"actuators": actuators, "knee": 'stiffness="7" damping="0.2"'})
+    return mujoco.MjModel.from_xml_string(text.replace("</mujoco>", f"{TENDONS}</mujoco>"))
+
+
+HIPS = '<motor name="r" joint="right_hip" gear="9"/><motor name="l" joint="left_hip" gear="9"/>'
+
+
+def test_a_joint_on_which_no_actuator_acts_stays_passive_with_its_spring():
+    body = adapted(with_tendon(HIPS))
+    model = body.spec.compile()
+    assert [model.actuator(index).name for index in range(model.nu)] == ["right_thigh", "left_thigh"]
+    assert (body.drives["right_shin"].torque_from, body.drives["left_shin"].torque_from) == ("passive", "passive")
+    knee = model.joint("right_shin")
+    assert (knee.stiffness[0], knee.damping[0], knee.armature[0]) == (7, 0.2, 0)
+
+
+def test_a_torque_that_is_given_makes_a_passive_joint_driven():
+    drives = adapted(with_tendon(HIPS), torques={"knee": 50.0}).drives
+    assert {name: drive.torque for name, drive in drives.items() if "shin" in name} == {
+        "right_shin": 50,
+        "left_shin": 50,
+    }
+
+
+def test_a_joint_that_a_motor_drives_through_a_tendon_is_not_passive():
+    body = adapted(with_tendon(HIPS + '<motor name="pull" tendon="right_pull"/>'))
+    assert (body.drives["right_shin"].torque_from, body.drives["left_shin"].torque_from) == ("guessed", "passive")
+    assert body.left_out["actuator"] == ["pull"]
+
+
+def test_everything_left_out_is_listed_by_kind_and_name():
+    assert adapted(with_tendon(HIPS)).left_out == {
+        "tendon": ["right_pull"],
+        "equality constraint": ["coupled"],
+        "sensor": ["angle"],
+        "keyframe": ["crouch"],
+    }
+
+
+def test_joints_that_are_passive_on_both_sides_keep_the_contract_and_those_on_one_side_break_it():
+    def findings(torques):
+        body = adapted(with_tendon(HIPS), torques=torques)
+        return [violation.finding for violation in violations(body.spec, feet=body.feet, sides=body.sides)]
+
+    assert not [finding for finding in findings({}) if "actuators" in finding]
+    assert "lacks the actuators right_shin" in findings({"left_knee": 50.0})
+
+
+@pytest.mark.parametrize("size", [0.05, 1.0, 4.0])
+def test_the_same_bodies_are_feet_whatever_the_size(size):
+    model = robot()
+    for lengths in (model.body_pos, model.body_ipos, model.geom_pos, model.geom_size, model.jnt_pos):
+        lengths *= size
+    model.qpos0[:3] *= size
+    assert adapted(model).feet == ("right_shin", "left_shin")
+
+
+def test_a_limb_has_at_most_two_feet_and_a_tail_is_none():
+    tail = '<body name="tail" pos="-0.5 0 0"><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.78"/></body>'
+    text = ROBOT.format(**PLAIN).replace('<body name="right_thigh"', f'{tail}<body name="right_thigh"')
+    for side in ("right", "left"):
+        ends = "".join(f'<body name="{side}_{end}" pos="0.1 0 0"><geom size="0.05" pos="0 0 -0.35"/>' for end in "abc")
+        sole = f'<geom name="{side}_sole" type="box" pos="0.05 0 -0.35" size="0.15 0.05 0.05" mass="0.5"/>'
+        text = text.replace(sole, sole + ends + "</body>" * 3)
+    body = adapted(mujoco.MjModel.from_xml_string(text))
+    assert body.feet == ("right_b", "right_c", "left_b", "left_c")
+
+
+DOG = """<robot name="dog">
+<link name="base"/>
+<joint name="fix" type="fixed"><parent link="base"/><child link="trunk"/></joint>
+<link name="trunk"><inertial><mass value="10"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>
+</inertial><collision><geometry><box size="0.4 0.2 0.1"/></geometry></collision></link>{legs}</robot>"""
+LEG = """<joint name="{side}_hip" type="revolute"><parent link="trunk"/><child link="{side}_leg"/>
+<origin xyz="{x} {y} 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="30" velocity="9"/></joint>
+<link name="{side}_leg"><inertial><origin xyz="0 0 -.15"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0 0 -.15"/><geometry><box size="0.04 0.04 0.3"/></geometry></collision></link>"""
+FIXED_DOG = DOG.format(
+    legs="".join(
+        LEG.format(side=side, x=x, y=y)
+        for side, x, y in [("fr", 0.2, -0.1), ("fl", 0.2, 0.1), ("hr", -0.2, -0.1), ("hl", -0.2, 0.1)]
+    )
+)
+
+
+def test_a_fixed_trunk_that_was_merged_into_the_world_is_recognised():
+    with pytest.raises(ValueError, match=r"fr_leg, fl_leg, hr_leg, hl_leg hang on the world.* pass --floating"):
+        adapted(mujoco.MjSpec.from_string(FIXED_DOG).compile())
+
+
+def test_a_floating_trunk_keeps_all_legs_and_its_mass():
+    spec = mujoco.MjSpec.from_string(FIXED_DOG)
+    float_trunk(spec)
+    body = adapted(spec.compile())
+    model = body.spec.compile()
+    assert body.root == "base"
+    assert model.body_mass.tolist() == [0, 10, 1, 1, 1, 1]
+    assert sorted(body.feet) == ["fl_leg", "fr_leg", "hl_leg", "hr_leg"]
+
+
+def test_a_trunk_that_cannot_float_is_named():
+    spec = mujoco.MjSpec.from_string(ROBOT.format(**PLAIN))
+    with pytest.raises(ValueError, match="--floating: trunk already has a joint"):
+        float_trunk(spec)
+    with pytest.raises(ValueError, match="--floating: right_shin does not hang on the world"):
+        float_trunk(spec, "right_shin")
+
+
+def test_a_mesh_that_collides_is_named_with_its_body():
+    mesh = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
+    text = ROBOT.format(**PLAIN).replace("<worldbody>", mesh, 1)
+    shin = '<body name="left_shin" pos="0 0 -0.4">'
+    text = text.replace(shin, f'{shin}<geom type="mesh" mesh="m"/>')
+    with pytest.raises(ValueError, match="of the body left_shin is a mjGEOM_MESH"):
+        adapted(mujoco.MjModel.from_xml_string(text))
+
+
+def test_the_example_of_a_pose_moves_every_joint_that_is_beyond_its_range():
+    with pytest.raises(ValueError, match=r"--pose right_knee=-1.85 left_knee=-1.85"):
+        adapted(robot(bent=f"{np.degrees(-2.82)} {np.degrees(-0.89)}"))
