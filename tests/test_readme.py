@@ -15,18 +15,10 @@ def test_every_python_snippet_runs_by_itself(snippet):
     exec(compile(snippet, "README.md", "exec"), {})
 
 
-def test_the_readme_is_one_screen_and_begins_with_the_two_commands():
-    assert len(README.splitlines()) <= 110
+def test_the_readme_begins_with_the_two_commands():
     setting_up = next(block for block in re.findall(r"```bash\n(.*?)```", README, re.DOTALL))
     assert "\nmake demo " in setting_up
     assert "\nmake test " in setting_up
-
-
-def test_the_readmes_table_has_at_most_six_columns_and_four_caveats():
-    _, _, results = README.partition("\n## Results\n")
-    results, _, _ = results.partition("\n## ")
-    assert next(line for line in results.splitlines() if line.startswith("|")).strip("|").count("|") <= 5
-    assert results.count("\n- ") <= 4
 
 
 def test_the_loss_of_the_stock_agent_reaches_every_parameter_of_its_actor():
