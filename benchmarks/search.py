@@ -51,6 +51,8 @@ FIXED = (
     *("num_threads=1", "keep_checkpoints=1", "evaluation.episodes=0", "training.total_frames=1_000_000_000"),
 )
 
+RESULTS = Path(__file__).parent / "results" / "search"
+
 STEPS_PER_CHECKPOINT = 65_536
 
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -210,8 +212,17 @@ def processor() -> str:
     return f"{names.get('model name', platform.machine())} {family}"
 
 
-def search(task: str, method: str, root: Path, *, seconds: float, trials: int) -> None:
-    """Search, and write a row for each run of each trial after each stretch."""
+def search(task: str, method: str, root: Path, results: Path, *, seconds: float, trials: int) -> None:
+    """Search, and write a row for each run of each trial after each stretch.
+
+    Args:
+        task: Name of the task.
+        method: Name of the method.
+        root: Folder of the runs.
+        results: Folder of tables, and of Optuna's journal, from which the search goes on.
+        seconds: CPU seconds of a run.
+        trials: Number of trials.
+    """
     import optuna
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
@@ -219,7 +230,7 @@ def search(task: str, method: str, root: Path, *, seconds: float, trials: int) -
     name = f"{task}-{method}"
     study = optuna.create_study(
         study_name=name,
-        storage=JournalStorage(JournalFileBackend(str(root / "search.journal"))),
+        storage=JournalStorage(JournalFileBackend(str(results / "search.journal"))),
         load_if_exists=True,
         direction="maximize",
         sampler=optuna.samplers.TPESampler(seed=SEEDS[0], multivariate=True, n_startup_trials=6),
@@ -232,7 +243,7 @@ def search(task: str, method: str, root: Path, *, seconds: float, trials: int) -
         if trial.state == optuna.trial.TrialState.RUNNING:  # of an interrupted search
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
             study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
-    table = Table(root / f"{name}.csv")
+    table = Table(results / f"{name}.csv")
 
     def objective(trial: Any) -> float:
         own = suggest(trial, method)
@@ -267,10 +278,17 @@ def interval(words: Sequence[str]) -> str:
 
 
 def compare(
-    task: str, method: str, root: Path, candidates: dict[str, str], *, seconds: float, seeds: Sequence[int]
+    task: str,
+    method: str,
+    root: Path,
+    results: Path,
+    candidates: dict[str, str],
+    *,
+    seconds: float,
+    seeds: Sequence[int],
 ) -> None:
     """Train candidates to the end with every seed, and write a row for each run; rows that are there stay."""
-    table = Table(root / f"{task}-{method}-candidates.csv")
+    table = Table(results / f"{task}-{method}-candidates.csv")
     for seed in seeds:
         for name, settings in candidates.items():
             own = settings.split()
@@ -327,10 +345,11 @@ def main(argv: Sequence[str] | None = None, run: Callable[..., None] = search) -
     parser.add_argument("--trials", type=int, default=6)
     parser.add_argument("--candidate", action="append", default=[], metavar="NAME=SETTINGS", help="instead of a search")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of candidates")
-    parser.add_argument("--root", type=Path, default=Path("runs/search"))
+    parser.add_argument("--root", type=Path, default=Path("runs/search"), help="folder of the runs")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
     arguments = parser.parse_args(argv)
-    arguments.root.mkdir(parents=True, exist_ok=True)
-    place = (arguments.task, arguments.method, arguments.root)
+    arguments.results.mkdir(parents=True, exist_ok=True)
+    place = (arguments.task, arguments.method, arguments.root, arguments.results)
     seconds = 60 * arguments.minutes
     if arguments.candidate:
         candidates = dict(one.split("=", 1) for one in arguments.candidate)

@@ -204,7 +204,7 @@ def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_ag
     monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
     words = ["heading", "scratch", "--minutes", "0.01", "--seeds", "7", "--candidate", f"tiny={tiny}"]
     for _ in range(2):
-        search.main([*words, "--root", str(tmp_path)])
+        search.main([*words, "--root", str(tmp_path), "--results", str(tmp_path)])
     with (tmp_path / "heading-scratch-candidates.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["trial"], row["seed"], row["settings"]) == ("tiny", "7", tiny)
@@ -213,7 +213,7 @@ def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_ag
     returns = [float(row[f"{mode}_return"]) for mode in ("deterministic", "stochastic")]
     assert float(row["score"]) == pytest.approx(sum(returns) / 2)
     with pytest.raises(SystemExit, match="tiny"):
-        search.main([*words[:3], "1", *words[4:], "--root", str(tmp_path)])
+        search.main([*words[:3], "1", *words[4:], "--root", str(tmp_path), "--results", str(tmp_path)])
 
 
 def test_every_method_is_searched_over_settings_that_it_has(search):
