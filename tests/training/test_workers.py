@@ -68,9 +68,25 @@ def test_a_task_that_waits_for_a_dead_worker_is_given_up_within_seconds_and_the_
     assert not set(workers) & set(multiprocessing.active_children())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a fork")
+def test_workers_are_spawned_in_a_process_that_starts_others_otherwise_as_joblib_s_jobs_do():
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("fork", force=True)
+    try:
+        with new_workers() as workers:
+            multiprocessing.Process(target=time.sleep, args=(60.0,)).start()
+        assert type(workers[0]._popen).method == "spawn"
+        assert multiprocessing.get_start_method() == "fork"
+    finally:
+        multiprocessing.set_start_method(before, force=True)
+        end(workers)
+
+
 def test_a_start_whose_worker_dies_without_a_word_is_given_up_within_seconds():
     def starting():
-        start(time.sleep, 60.0).kill()
+        worker = start(time.sleep, 60.0)
+        time.sleep(0.5)
+        worker.kill()
         for_ever()
 
     began = time.monotonic()

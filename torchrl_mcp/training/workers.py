@@ -55,7 +55,7 @@ def begun(start: Callable[[], Result]) -> Result:
     thread.start()
     workers: list[BaseProcess] = []
     while thread.is_alive():
-        thread.join(INTERVAL / 5)
+        thread.join(INTERVAL / 10)  # a worker that ended before it was seen would be waited for
         workers += [process for process in _started_beside(others) if process not in workers]
         try:
             _require_alive(workers)
@@ -74,14 +74,18 @@ def begun(start: Callable[[], Result]) -> Result:
 
 @contextmanager
 def new_workers() -> Iterator[list[BaseProcess]]:
-    """Yield a list, to which the processes that the block starts are added; if the block fails, end them."""
+    """Yield a list, to which the processes that the block spawns are added; if the block fails, end them."""
     others = set(multiprocessing.active_children())
     workers: list[BaseProcess] = []
+    method = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("spawn", force=True)  # in its jobs, joblib sets a method of its own
     try:
         yield workers
     except BaseException:
         end(_started_beside(others))
         raise
+    finally:
+        multiprocessing.set_start_method(method, force=True)
     workers += _started_beside(others)
 
 
