@@ -137,7 +137,7 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
         (["run_dir=~/größe"], f"""without quotes: write 'run_dir="{Path.home()}/größe"'"""),
         (["resume=a=b"], """without quotes: write 'resume="a=b"'"""),
         (["sead=3"], "the nearest are: seed"),
-        (["method=mcp", "latent_dim=3"], "is no setting of this method: torchrl-mcp-train --cfg job prints all"),
+        (["method=mcp", "latent_dim=3"], "is no setting of this method"),
     ],
 )
 def test_what_hydra_cannot_compose_is_answered_in_a_line(command, tmp_path, arguments, answer):

@@ -204,7 +204,7 @@ def test_the_statistics_of_four_episodes_by_hand():
     numbers = episode_statistics(outcome, lambda returns: returns / 10)
     low, high = numbers.pop("interval")
     assert 0 <= low < 0.3 < high <= 0.6
-    assert numbers.pop("metrics") == {}
+    assert numbers.pop("metrics") == numbers.pop("durations") == {}
     assert numbers == pytest.approx(
         {
             "normalised_return": 0.3,

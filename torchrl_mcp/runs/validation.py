@@ -89,7 +89,7 @@ NAMES_BY_RULE: dict[Rule, str] = {
         lr min_lr max_lr step_size.actor step_size.max step_size.critic target_kl clip_epsilon advantages.clip
         action_std initial_std std logits_std scale max_error width kept_width std_gain
     """,
-    POSITIVE.or_null(): "max_grad_norm physics_timestep",
+    POSITIVE.or_null(): "max_grad_norm physics_timestep learned_logits_std latent_std",
     PERIOD: "switch_interval speed_interval step_size.inputs critic.inputs",
     SPEED: "speed",
     NOT_NEGATIVE: """

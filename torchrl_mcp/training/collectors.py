@@ -227,7 +227,8 @@ class RemoteSource:
         # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
         try:
             with threads_kept(), new_workers() as self._workers:
-                self._collector = begun(make_collector)
+                local = self._backend["backend"] == "process"
+                self._collector = begun(make_collector) if local else make_collector()  # Ray starts in the main thread
         except BaseException:
             weights.shutdown()  # at the interpreter's exit it would wait for ever for a thread that cannot start
             raise
