@@ -282,7 +282,7 @@ def _is_evaluated(name: str, value: Any) -> bool:
     """Return whether a quantity of an evaluation has a valid type."""
     if name == "interval":
         return isinstance(value, list) and len(value) == 2
-    if name in ("metrics", "diagnostics", "reach"):
+    if name in ("metrics", "durations", "diagnostics", "reach"):
         return isinstance(value, dict) and all(isinstance(number, int | float) for number in value.values())
     return isinstance(value, int | float)
 
