@@ -66,7 +66,8 @@ def write(
         columns = ["iteration", "frames", "seconds", "episode/count", "episode/normalised_return"]
         csv.writer(file).writerows([columns, *rows] if rows else [])
     if preset:
-        origin = {"commit": commit, "choices": {"preset": preset, "symmetry": symmetry}, "machine": MACHINE}
+        choices = {"preset": preset, "symmetry": symmetry}
+        origin = {"command": ["torchrl-mcp-train"], "commit": commit, "choices": choices, "machine": MACHINE}
         (folder / "origin.json").write_text(json.dumps(origin))
     if score is not None:
         modes = {"deterministic": score, "stochastic": score - 0.1}

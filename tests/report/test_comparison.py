@@ -1,5 +1,6 @@
 """Which runs share a cell, and what is compared between cells."""
 
+import json
 import math
 from itertools import count
 
@@ -138,6 +139,51 @@ def test_a_method_of_your_own_is_known_by_the_title_and_the_settings_that_it_tel
         variant, standard = standard, variant
     assert (standard.title, standard.is_standard, variant.is_standard) == ("My Own", True, False)
     assert (row(standard).label, row(variant).label) == ("My Own", "My Own, top=2")
+
+
+TEMPERED = [
+    *("method.explorer.distribution_class", "mixer", "mixer.distribution_class"),
+    *("exploration.actor.distribution_class", "parts.distribution_class", "actor.distribution_class"),
+]
+"""Where a resolved configuration has the temperature of a mixer to which other settings refer."""
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "transfer"])
+def test_a_setting_to_which_others_refer_is_named_once_by_its_shortest_path(write_mcp, stage):
+    about = {
+        "stage": stage,
+        "mixer__name": "tempered",
+        "method__title": "MCP",
+        "method__standard__mixer": "multiplicative",
+    }
+    folders = [
+        write_mcp(str(value), **about, **{f"{path}.temperature".replace(".", "__"): value for path in TEMPERED})
+        for value in (1, 4)
+    ]
+    labels = [row(cell).label for cell in grouped(*folders)]
+    assert labels == [f"MCP, tempered mixer, mixer.temperature={value}" for value in (1, 4)]
+
+
+def test_settings_with_equal_values_that_the_command_line_names_are_all_named(write_run):
+    folders = [write_run(str(value), step_size__actor=value, step_size__critic=value) for value in (0.1, 0.2)]
+    assert [cell.settings for cell in grouped(*folders)] == [{"step_size.actor": 0.1}, {"step_size.actor": 0.2}]
+    for folder in folders:
+        origin = json.loads((folder / "origin.json").read_text())
+        command = ["torchrl-mcp-train", "step_size.critic=1", "+step_size.actor=1"]
+        (folder / "origin.json").write_text(json.dumps(origin | {"command": command}))
+    assert [list(cell.settings) for cell in grouped(*folders)] == [["step_size.actor", "step_size.critic"]] * 2
+
+
+def test_runs_of_different_titles_have_a_row_each_with_their_title_alone(write_mcp):
+    titles = ["MCP", "Tempered MCP"]
+    folders = [write_mcp(title, method__title=title, score=0.5) for title in titles]
+    assert [row(cell).label for cell in grouped(*folders)] == titles
+
+
+def test_a_variant_is_named_also_where_no_other_is_beside_it(write_mcp):
+    (cell,) = grouped(write_mcp("a", mixer__name="additive"))
+    assert not cell.is_standard
+    assert row(cell).label == "MCP, additive mixer"
 
 
 def test_cells_with_the_same_label_have_a_curve_each(write_run):

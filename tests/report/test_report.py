@@ -76,6 +76,28 @@ def test_a_single_method_or_task_is_no_comparison(write_run, write_mcp):
         assert not any("Over all tasks" in page for page in report(*find_runs(folders), moment=MOMENT).values())
 
 
+def test_diagnostics_tell_the_stages_of_a_task_apart(write_mcp, parse_page):
+    gates = {"gates/effective_primitives": 2.0, "gates/usage_0": 1.0}
+    for stage in ("pretrain", "transfer"):
+        folder = write_mcp(stage, stage=stage, task="holdout", character="ant", score=0.5, diagnostics=gates)
+    pages = report(*find_runs([folder.parent]), moment=MOMENT)
+    _, *found = rows(next(section(parse_page(pages["report.html"]), "diagnostics").all("table")))
+    assert sorted(row[1] for row in found) == ["pretrain", "transfer"]
+    _, table = pages["report.md"].split("## Gates", 1)
+    assert [line.split(" | ")[1] for line in table.splitlines() if "Holdout" in line] == [row[1] for row in found]
+
+
+def test_where_the_paper_has_no_number_nothing_is_compared_with_it(write_mcp, write_run, page, pages, parse_page):
+    for write, name in ((write_mcp, "mcp"), (write_run, "scratch")):
+        folder = write(name, task="juggle", score=0.5)
+    alone = report(*find_runs([folder.parent]), moment=MOMENT)
+    assert "paper" not in alone["report.md"]
+    own = parse_page(alone["report.html"])
+    assert not [name for name in ("overview", "transfer", "reading") if "paper" in section(own, name).text]
+    assert "paper" in pages["report.md"]
+    assert all("paper" in section(page, name).text for name in ("overview", "transfer", "reading"))
+
+
 def test_an_ablation_compares_its_settings(page):
     (table,) = section(page, "ablations").all("table")
     assert [row[:2] for row in rows(table)] == [
@@ -117,7 +139,7 @@ def test_damaged_folders_are_listed_with_the_reason(page):
 def test_diagnostics_of_gates_are_shown_with_a_group_of_bars_per_seed(page):
     table = next(section(page, "diagnostics").all("table"))
     row = next(row for row in table.all("tr") if "MCP" in row.text)
-    assert [cell.text for cell in row.all("td")][:3] == ["MCP", "2.500", "1.500"]
+    assert [cell.text for cell in row.all("td")][:4] == ["transfer", "MCP", "2.500", "1.500"]
     bars = list(row.all("svg"))
     assert [bar.attributes["aria-label"] for bar in bars] == [f"Usage, seed {seed}: 0.900 0.600" for seed in range(3)]
     assert [float(rect.attributes["height"]) for rect in bars[0].all("rect")] == pytest.approx([20, 20 * 0.6 / 0.9])

@@ -69,15 +69,20 @@ class Cell:
         return self.runs[0].total_frames
 
     @property
-    def is_standard(self) -> bool:
-        """Whether the settings are the method's standard ones, so that the cell is no variant.
+    def variations(self) -> dict[str, Any]:
+        """Choices that are not the method's standard ones, by the names of their settings.
 
         Unless the method says otherwise, a new gate is standard, and no use of the character's symmetry.
         """
         standard = {"gate": None, "symmetry": None} | self.runs[0].standard
         if self.stage == "pretrain":
             standard.pop("trained", None)  # a choice of transfer: pre-training trains all parts
-        return all(self.choices[name] == value for name, value in standard.items())
+        return {name: self.choices[name] for name, value in standard.items() if self.choices[name] != value}
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether the settings are the method's standard ones, so that the cell is no variant."""
+        return not self.variations
 
     @property
     def is_shared(self) -> bool:

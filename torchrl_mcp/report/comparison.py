@@ -52,11 +52,11 @@ def choices(run: Run) -> dict[str, Any]:
 def cells(runs: Iterable[Run]) -> list[Cell]:
     """Group runs into cells, in the paper's order of tasks, stages and methods.
 
-    Runs of one task, character, stage and method share a cell unless their :func:`choices` differ, or any other
+    Runs of one task, character, stage, method and title share a cell unless their :func:`choices` differ, or any other
     setting that :mod:`~torchrl_mcp.runs.identity` counts. Runs of different commits may share a cell.
     """
     found = []
-    for alike in grouped(runs, lambda run: (run.place, run.stage, run.method)).values():
+    for alike in grouped(runs, lambda run: (run.place, run.stage, run.method, run.title)).values():
         telling = varying([choices(run) for run in alike])
         for chosen in grouped(alike, lambda run: _frozen(choices(run))).values():
             found += _cells(chosen, telling)
@@ -108,7 +108,7 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
 
 def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
     """Cells of runs with the same choices; ``telling`` are the names of choices that differ from other runs."""
-    others = varying([_learned(run) for run in runs])
+    others = _independent(varying([_learned(run) for run in runs]), runs)
     found = []
     for alike in grouped(runs, lambda run: _frozen(_learned(run), others)).values():
         first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
@@ -117,6 +117,21 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
         by_seed = sorted(alike, key=lambda run: run.seed)
         found.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
     return found
+
+
+def _independent(names: Sequence[str], runs: Sequence[Run]) -> list[str]:
+    """Return settings without those that only repeat another one, as references such as ``${mixer.temperature}`` do.
+
+    Of settings with equal values in all runs, those of a command line stand for all, else the shortest path.
+    """
+    given = {name for run in runs for name in run.overrides}
+    alike = grouped(names, lambda name: tuple(repr(run.settings.get(name, DEFAULT)) for run in runs)).values()
+    chosen = {name for group in alike for name in given.intersection(group) or [min(group, key=_depth)]}
+    return [name for name in names if name in chosen]
+
+
+def _depth(name: str) -> tuple[int, int]:
+    return name.count("."), len(name)
 
 
 def _learned(run: Run) -> dict[str, Any]:

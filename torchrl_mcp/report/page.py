@@ -69,6 +69,7 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
         "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
         "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_standard]),
         "picture": _picture(found),
+        "has_reported": any(cell.reported for cell in found),
         "titles": methods(found),
         "shared": shared,
         "aggregate": aggregate if min(len(shared), len(aggregate)) > 1 else {},

@@ -127,12 +127,23 @@ class Run:
     def preset(self) -> str:
         """Preset of the settings: ``demo`` for runs of the demonstration, ``unknown`` if not recorded."""
         is_demo = any(name.startswith("demo.") for name in self.settings)
-        return self.provenance.get("choices", {}).get("preset", "demo" if is_demo else "unknown")
+        return self._choices.get("preset", "demo" if is_demo else "unknown")
 
     @property
     def commit(self) -> str:
         """Commit of the library at the start, ``unknown`` if not recorded."""
         return self.provenance.get("commit") or "unknown"
+
+    @property
+    def _choices(self) -> dict[str, str]:
+        """Choices of groups of settings, empty if not recorded."""
+        return self.provenance.get("choices") or {}
+
+    @property
+    def overrides(self) -> list[str]:
+        """Names of the settings on the command line that started the run."""
+        words = self.provenance.get("command") or []
+        return [word.partition("=")[0].lstrip("+~") for word in words if "=" in word]
 
     @property
     def curriculum_name(self) -> str | None:
@@ -142,7 +153,7 @@ class Run:
     @property
     def symmetry(self) -> str | None:
         """Choice of the group ``symmetry``, None for ``none`` or if not recorded."""
-        choice = self.provenance.get("choices", {}).get("symmetry")
+        choice = self._choices.get("symmetry")
         return None if choice == "none" else choice
 
     @property
@@ -291,8 +302,11 @@ def _provenance(folder: Path) -> dict[str, Any]:
     if not (folder / PROVENANCE).exists():
         return {}
     content = read_json(folder / PROVENANCE)
-    for name, kind in {"choices": dict, "machine": dict, "commit": str, "precision": str}.items():
+    kinds = {"choices": dict, "machine": dict, "command": list, "commit": str, "precision": str}
+    for name, kind in kinds.items():
         if not isinstance(content.get(name), kind | None):
+            raise ValueError(f"its {name} is {content[name]!r}")
+        if kind is list and not all(isinstance(value, str) for value in content.get(name) or []):
             raise ValueError(f"its {name} is {content[name]!r}")
         if kind is dict and not all(isinstance(value, SAID[name]) for value in (content.get(name) or {}).values()):
             raise ValueError(f"its {name} are {content[name]!r}")

@@ -23,9 +23,9 @@ DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
 ABLATIONS = {
     "num_primitives": (
         "Number of primitives",
-        "Table 4 of the paper: the humanoid dribbles with 4, 8, 16 and 32 primitives.",
+        "How many primitives the gate weighs. The paper varies it in Table 4.",
     ),
-    "trained": ("Gate alone, or gate and primitives", "Figure 8 of the paper: similar returns on most tasks."),
+    "trained": ("Gate alone, or gate and primitives", "What transfer trains. The paper compares both in Figure 8."),
     "mixer": ("Mixer", "Multiplicative composition of primitives (Eq. 3), or additive (Eq. 1)."),
     "exploration": ("Exploration", "Over actions (Eq. 4), or over the weights of primitives (Section 5.3)."),
     "curriculum": (
@@ -165,9 +165,10 @@ def method_colours(cells: Sequence[Cell]) -> dict[str, str]:
 
 
 def row(cell: Cell) -> Row:
-    """Return a cell under the title of its method, without the method's standard settings."""
+    """Return a cell under the title of its method, with its variations and without the method's standard settings."""
     standard = cell.runs[0].standard
-    telling = {name: value for name, value in cell.settings.items() if name not in standard or value != standard[name]}
+    settings = {name: value for name, value in {**cell.variations, **cell.settings}.items() if value is not None}
+    telling = {name: value for name, value in settings.items() if name not in standard or value != standard[name]}
     words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in telling.items())
     return Row(cell, cell.title, ", ".join(words))
 
