@@ -50,7 +50,7 @@ class Transport(PDCharacterEnv):
 
     num_reward_terms = 4
 
-    units = MappingProxyType({**UNITS, "waypoint": LOGARITHMIC})
+    units: Mapping[str, str] = MappingProxyType({**UNITS, "waypoint": LOGARITHMIC})
 
     objects: ClassVar[Mapping[str, int]]
     """The objects in the order of the scene, and how many numbers the goal has of each."""
