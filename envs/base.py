@@ -58,6 +58,18 @@ class CharacterEnv(EnvBase):
         ValueError: If an argument is out of range.
     """
 
+    scene: str = ""
+    """MJCF of the character in its scene; empty if a task does not provide it."""
+
+    observation_layout: Mapping[str, slice] = MappingProxyType({})
+    """Slices of ``observation`` by name, in order; empty if a task does not name them."""
+
+    goal_layout: Mapping[str, slice] = MappingProxyType({})
+    """Slices of ``goal`` by name, in order; empty if a task does not name them."""
+
+    units: Mapping[str, str] = MappingProxyType({})
+    """Units of the entries of ``observation`` and ``goal``, by name or by what follows its last dot."""
+
     batch_locked = True
     _supports_set_state = True
 

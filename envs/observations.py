@@ -18,6 +18,15 @@ from torchrl_mcp.envs.physics.arrays import Array, as_array, as_tensor, by_compo
 SIZES = {"position": 3, "orientation": 4, "linear_velocity": 3, "angular_velocity": 3}
 """Quantities observed of a body, in this order, with their sizes: 13 numbers."""
 
+UNITS = {
+    "root_height": "m",
+    "position": "m",
+    "orientation": "quaternion w x y z",
+    "linear_velocity": "m/s",
+    "angular_velocity": "rad/s",
+}
+"""Units of the quantities of a character's state."""
+
 
 def bodies_in_heading_frame(angle: Tensor, origin: Tensor, bodies: BodyStates) -> Tensor:
     """Position, orientation, linear and angular velocity of bodies, in the frame of an origin and a heading.
@@ -111,7 +120,17 @@ def _rows(seen: Array, angle: Tensor) -> Tensor:
 
 def state_layout(bodies: list[str]) -> dict[str, slice]:
     """Slices of :func:`character_state`, by body and quantity."""
-    layout, start = {"root_height": slice(0, 1)}, 1
+    return {"root_height": slice(0, 1), **bodies_layout(bodies, start=1)}
+
+
+def bodies_layout(bodies: list[str], *, start: int = 0) -> dict[str, slice]:
+    """Slices of :func:`bodies_in_heading_frame`, by body and quantity.
+
+    Args:
+        bodies: Names of the bodies.
+        start: Index of the first number.
+    """
+    layout = {}
     for body in bodies:
         for quantity, size in SIZES.items():
             layout[f"{body}.{quantity}"] = slice(start, start + size)

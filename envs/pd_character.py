@@ -19,7 +19,7 @@ from torchrl_mcp.envs.characters.mirror import Mirror, mirror_actions, mirror_st
 from torchrl_mcp.envs.characters.stance import rest_controls
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.initial_states import InitialStates
-from torchrl_mcp.envs.observations import character_state, state_layout
+from torchrl_mcp.envs.observations import UNITS, character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
 from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
@@ -65,6 +65,8 @@ class PDCharacterEnv(CharacterEnv):
     num_reward_terms = 0
     """Number of terms of the task's reward that ``reward_weights`` of a curriculum may weigh."""
 
+    units: Mapping[str, str] = MappingProxyType(UNITS)
+
     def __init__(
         self,
         character: str,
@@ -106,7 +108,6 @@ class PDCharacterEnv(CharacterEnv):
             )
         model = spec.compile()
         self.scene = spec.to_xml()
-        """MJCF of the character in its scene."""
         super().__init__(
             model,
             num_envs,
@@ -128,7 +129,6 @@ class PDCharacterEnv(CharacterEnv):
         shapes = falling_geoms(model, self.character.feet, len(self._bodies))
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
-        """Slices of ``observation`` by name."""
         # Live views, made once. Body 0 is the world; the character's bodies come next, and then the task's objects.
         own, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
         self._positions, self._orientations = outputs["xpos"][:, own], outputs["xquat"][:, own]

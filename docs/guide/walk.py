@@ -17,14 +17,14 @@ def rotated(vectors: np.ndarray, angle: float) -> np.ndarray:
     return vectors @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
-def heading(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+def heading(data: mujoco.MjData) -> float:
     """Angle of the root's x axis from the world's, in radians."""
     return float(np.arctan2(data.xmat[1, 3], data.xmat[1, 0]))
 
 
 def observe(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """State of the character, ``(S,)``: the entries that the metadata name, in their order."""
-    angle = heading(model, data)
+    angle = heading(data)
     turn = np.array([np.cos(angle / 2), 0, 0, -np.sin(angle / 2)])
     parts = [data.xpos[1, 2:]]
     for body in range(1, model.nbody):
@@ -54,7 +54,7 @@ def main() -> None:
     substeps = round(metadata["control_timestep"] / metadata["physics_timestep"])
     mujoco.mj_forward(model, data)
     while data.time < SECONDS:
-        angle = -heading(model, data)  # of the target direction, seen by the character
+        angle = -heading(data)  # of the target direction, seen by the character
         goal = np.array([[np.cos(angle), np.sin(angle)]], dtype=np.float32)
         observation = observe(model, data)[None].astype(np.float32)
         (action,) = session.run(["action"], {"observation": observation, "goal": goal})

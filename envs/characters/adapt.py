@@ -198,11 +198,14 @@ def _drives(
     driven = driven_joints(model, rest.data.qpos)
     drives = {}
     for body, name in jointed.items():
-        if body not in torque and driven.isdisjoint(joints_of(model, body)):
-            drives[name] = passive_drive(model, body)
+        undriven = [model.joint(joint).name for joint in joints_of(model, body) if joint not in driven]
+        if body not in torque and len(undriven) == len(joints_of(model, body)):
+            remark = "--gain does not count without --torque" if body in gain else ""
+            drives[name] = passive_drive(model, body).with_remark(remark)
             continue
         needed = load(posed, posed.body(name).id, soles)
-        drives[name] = drive(model, body, needed, torque.get(body), gain.get(body))
+        remark = f"drives {', '.join(undriven)} too, without a motor in the file" if undriven else ""
+        drives[name] = drive(model, body, needed, torque.get(body), gain.get(body)).with_remark(remark)
     return drives
 
 
@@ -239,7 +242,10 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
             "called world with the base of the URDF"
         )
     if trunk in hanging:
-        raise ValueError(f"the root {names[trunk]} has joints other than a free joint: replace them by a freejoint")
+        raise ValueError(
+            f"the root {names[trunk]} has joints other than a free joint: replace them by a freejoint, or pass "
+            "--floating if its trunk is fixed to the world"
+        )
     for body in others:
         kinds = kinds_of(model, body)
         if any(kind not in (BALL, HINGE) for kind in kinds) or (BALL in kinds and len(kinds) > 1):

@@ -21,8 +21,11 @@ CONTROL_TIMESTEP = 1 / 30
 FREE, BALL, HINGE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_HINGE)
 )
+LIMB_HEIGHT = 0.1
+"""Largest height of the lowest point of a leg above that of the rest pose, in heights of the root above that point."""
+
 FOOT_HEIGHT = 0.03
-"""Largest height of a foot above the lowest point of the rest pose, in heights of the root above that point."""
+"""Largest height of a foot above the lowest point of its leg, in the same unit."""
 
 LIMB_FEET = 2
 """Largest number of feet on a line of bodies, such as heel and toes."""
@@ -89,38 +92,56 @@ def violations(
     return found
 
 
+def lowest_points(model: mujoco.MjModel) -> dict[str, float]:
+    """Return the height of the lowest point of each body that collides, in the rest pose, in metres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    heights: dict[str, float] = {}
+    for geom in colliding(model):
+        name = model.body(model.geom_bodyid[geom]).name
+        heights[name] = min(_lowest(model, data, geom), heights.get(name, math.inf))
+    return heights
+
+
 def lowest_bodies(model: mujoco.MjModel) -> tuple[float, list[str]]:
     """Return the height of the lowest point in the rest pose, in metres, and the bodies close to it.
 
     A body is close if its height above the lowest point is at most :data:`FOOT_HEIGHT` times that of the root.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    heights = [(_lowest(model, data, geom), model.body(model.geom_bodyid[geom]).name) for geom in colliding(model)]
+    heights = lowest_points(model)
     if not heights:
         return 0.0, []
-    lowest = min(height for height, _ in heights)
-    highest = lowest + FOOT_HEIGHT * max(float(data.xpos[1, 2]) - lowest, 0.0)
-    return lowest, list(dict.fromkeys(name for height, name in heights if height <= highest))
+    lowest = min(heights.values())
+    highest = lowest + FOOT_HEIGHT * _root_height(model, lowest)
+    return lowest, [name for name, height in heights.items() if height <= highest]
 
 
 def guessed_feet(model: mujoco.MjModel, sides: Sides = ()) -> list[str]:
-    """Return the bodies that are probably feet: the lowest in the rest pose, at the ends of limbs.
+    """Return the bodies that are probably feet: the lowest of each leg, at its end.
 
-    On each line from the root, the outermost :data:`LIMB_FEET` bodies are feet. If some of them have a twin on the
-    other side, the others, such as a tail, are not feet.
+    A leg is a line of bodies that comes close to the ground in the rest pose, see :data:`LIMB_HEIGHT`. Its feet are
+    the outermost :data:`LIMB_FEET` of its lowest bodies, see :data:`FOOT_HEIGHT`. If some feet have a twin on the other
+    side, the others, such as a tail, are not feet.
 
     Args:
         model: The body.
         sides: Beginnings or ends of bodies' names, right and left.
     """
-    lowest = lowest_bodies(model)[1]
-    lines = {name: {model.body(body).name for body in line_of(model, model.body(name).id)} for name in lowest}
-    beyond = {name: [other for other in lowest if other != name and name in lines[other]] for name in lowest}
-    depth = {
-        name: 1 + max((len(lines[other] & {*beyond[name]}) for other in beyond[name]), default=0) for name in lowest
+    heights = lowest_points(model)
+    lowest = min(heights.values(), default=0.0)
+    unit = _root_height(model, lowest)
+    lines = {
+        name: [model.body(body).name for body in line_of(model, model.body(name).id)]
+        for name, height in heights.items()
+        if height <= lowest + LIMB_HEIGHT * unit
     }
-    feet = [name for name in lowest if depth[name] <= LIMB_FEET]
+    inner = {name for line in lines.values() for name in line[1:]}
+    ends: set[str] = set()
+    for line in (line for name, line in lines.items() if name not in inner):
+        leg = [name for name in line if name in lines]
+        highest = min(heights[name] for name in leg) + FOOT_HEIGHT * unit
+        ends |= {*[name for name in leg if heights[name] <= highest][:LIMB_FEET]}
+    feet = [name for name in heights if name in ends]
     return [name for name in feet if twin(name, sides) != name and twin(name, sides) in feet] or feet
 
 
@@ -313,6 +334,13 @@ def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:
     steps = CONTROL_TIMESTEP / model.opt.timestep
     if not math.isclose(steps, round(steps), rel_tol=1e-6):
         yield Violation(f"its timestep of {model.opt.timestep:g} s does not divide 1/30 s", "take 1/120 s, for example")
+
+
+def _root_height(model: mujoco.MjModel, lowest: float) -> float:
+    """Height of the root above the lowest point in the rest pose, in metres."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return max(float(data.xpos[1, 2]) - lowest, 0.0)
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

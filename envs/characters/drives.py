@@ -60,6 +60,10 @@ class Drive(NamedTuple):
     spring: float
     remark: str
 
+    def with_remark(self, remark: str) -> "Drive":
+        """Add a remark, unless it is empty."""
+        return self._replace(remark=", ".join(filter(None, [self.remark, remark])))
+
 
 class Motor(NamedTuple):
     """What a file says about the motors of a joint; 0 where it says nothing.

@@ -11,11 +11,13 @@ from torchrl_mcp.envs.arguments import interval, not_negative, positive
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
+from torchrl_mcp.envs.tasks.transport import LOGARITHMIC
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
 
 
@@ -37,7 +39,7 @@ class Heading(PDCharacterEnv):
         speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin with 0. Paper: 1.
         speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for none.
         waypoint: End the goal with a place in the target direction, as :func:`.place_seen` shows it, see
-            :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`. ``goal_layout`` has its entries.
+            :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`. ``goal_layout`` has the names of the entries.
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
             faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
@@ -56,6 +58,8 @@ class Heading(PDCharacterEnv):
         torch.Size([2, 3, 105])
     """
 
+    units = MappingProxyType({**UNITS, "direction": "unit vector", "speed": "m/s", "waypoint": LOGARITHMIC})
+
     def __init__(
         self,
         character: str,
@@ -73,8 +77,12 @@ class Heading(PDCharacterEnv):
         if not speed_interval > 0:
             raise ValueError(f"speed_interval={speed_interval} is out of range: pass seconds, or inf for no changes")
         self.max_turn, self.speeds, self.waypoint = max_turn, _speeds(speed), waypoint
-        shown = 3 if self.changes_speed else 2  # the direction, and the speed
-        self.goal_layout = {"waypoint": slice(shown, shown + 2)} if waypoint else {}
+        shown = 3 if self.changes_speed else 2
+        self.goal_layout = {"direction": slice(0, 2)}
+        if self.changes_speed:
+            self.goal_layout["speed"] = slice(2, 3)
+        if waypoint:
+            self.goal_layout["waypoint"] = slice(shown, shown + 2)
         self.change_probability = CONTROL_TIMESTEP / speed_interval
         zero = torch.zeros((), dtype=torch.float64)
         super().__init__(
@@ -86,14 +94,6 @@ class Heading(PDCharacterEnv):
         )
         self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
         self.make_specs()
-
-    goal_units = MappingProxyType({"direction": "unit vector", "speed": "m/s"})
-    """Units of the entries of ``goal``."""
-
-    @property
-    def goal_sizes(self) -> dict[str, int]:
-        """Numbers of values of the first entries of ``goal``, by name."""
-        return {"direction": 2, "speed": 1} if self.changes_speed else {"direction": 2}
 
     @property
     def changes_speed(self) -> bool:

@@ -2,9 +2,12 @@
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import accumulate
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium
+import mujoco
 import torch
 from torch import Tensor
 
@@ -12,6 +15,7 @@ from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.rewards import holdout_reward
 
@@ -63,6 +67,17 @@ class Holdout(CharacterEnv):
         torch.Size([2, 3, 27])
     """
 
+    goal_layout = MappingProxyType({"direction": slice(0, 2)})
+    units = MappingProxyType(
+        {
+            **UNITS,
+            "direction": "unit vector",
+            "joint_angle": "rad",
+            "joint_velocity": "rad/s",
+            "contact_force": "torque in N m, then force in N, clipped to [-1, 1]",
+        }
+    )
+
     def __init__(
         self,
         num_envs: int,
@@ -89,7 +104,8 @@ class Holdout(CharacterEnv):
             contact_weight=contact_weight,
             reset_noise_scale=reset_noise_scale,
         )
-        model = ant().compile()
+        spec = ant()
+        model, self.scene = spec.compile(), spec.to_xml()
         episode = {"goal": torch.zeros(2, dtype=dtype)}
         if contact_forces:
             episode["contact_forces"] = torch.zeros(model.nbody, 6, dtype=torch.float64)
@@ -118,6 +134,7 @@ class Holdout(CharacterEnv):
         qpos, self._qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
         self._height, self._posture = qpos[:, 2], qpos[:, 2:]
         self.track(position=self.simulation.outputs["xpos"][:, TORSO, :2])
+        self.observation_layout = _layout(model, contact_forces)
         self.make_specs()
 
     @classmethod
@@ -194,3 +211,16 @@ class Holdout(CharacterEnv):
         tail = self.simulation.state["qpos"][index, :3].cpu() + torch.tensor([0.0, 0.0, 0.6])
         tip = tail + torch.nn.functional.pad(self.episode["goal"][index].cpu(), (0, 1))
         return [(tail.double().numpy(), tip.double().numpy())]
+
+
+def _layout(model: mujoco.MjModel, contact_forces: bool) -> dict[str, slice]:
+    """Slices of the observation by name: the root, the hinges, and external forces on bodies if they are observed."""
+    joints = [model.joint(joint).name for joint in range(1, model.njnt)]
+    sizes = {"root_height": 1, "root.orientation": 4}
+    sizes |= {f"{joint}.joint_angle": 1 for joint in joints}
+    sizes |= {"root.linear_velocity": 3, "root.angular_velocity": 3}
+    sizes |= {f"{joint}.joint_velocity": 1 for joint in joints}
+    if contact_forces:
+        sizes |= {f"{model.body(body).name or f'body_{body}'}.contact_force": 6 for body in range(1, model.nbody)}
+    ends = list(accumulate(sizes.values()))
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}

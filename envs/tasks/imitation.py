@@ -14,7 +14,7 @@ from torchrl_mcp.envs.characters.mirror import Mirror, mirror_bodies
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary, PlacedMotion
 from torchrl_mcp.envs.motions.placement import Placement, placing
-from torchrl_mcp.envs.observations import bodies_in_heading_frame
+from torchrl_mcp.envs.observations import bodies_in_heading_frame, bodies_layout
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
 from torchrl_mcp.envs.tasks.imitation_reward import (
@@ -137,6 +137,7 @@ class Imitation(PDCharacterEnv):
         super().__init__(
             character, num_envs, max_episode_steps=max_episode_steps, episode=reference, curriculum=None, **kwargs
         )
+        self.goal_layout = bodies_layout([f"step_{step + 1}.{name}" for step in range(NUM_TARGETS) for name in names])
         self.library, self._layout = library.to(self.device), joint_layout(character).to(self.device)
         self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
         ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)

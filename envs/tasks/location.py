@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -10,11 +11,12 @@ from torch import Tensor
 from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
+from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
-from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, logarithmic, near, steps
+from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, LOGARITHMIC, logarithmic, near, steps
 from torchrl_mcp.envs.tasks.waypoints import walkable, way
 
 STANDING_SPEED = 0.1
@@ -65,6 +67,8 @@ class Location(PDCharacterEnv):
         torch.Size([2, 3, 2])
     """
 
+    units = MappingProxyType({**UNITS, "place": LOGARITHMIC, "final_direction": "unit vector"})
+
     def __init__(
         self,
         character: str,
@@ -80,6 +84,9 @@ class Location(PDCharacterEnv):
     ) -> None:
         positive(speed=speed)
         self.speed, self.faces = speed, final_directions is not None
+        self.goal_layout = {"place": slice(0, 2)}
+        if self.faces:
+            self.goal_layout["final_direction"] = slice(2, 4)
         number, no = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool)
         episode = {"target": number.repeat(2), "final_direction": number, "seconds_left": number}
         super().__init__(

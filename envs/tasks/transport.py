@@ -31,6 +31,12 @@ POSITIONS = ("metres", "logarithmic")
 LINEAR_DISTANCE = 0.25
 """Distance in metres below which logarithmic positions are nearly linear."""
 
+LOGARITHMIC = f"horizontal vector of length ln(1 + r / {LINEAR_DISTANCE} m), r the distance"
+"""Unit of a logarithmic place on the ground."""
+
+POSITION_UNIT = f"{LOGARITHMIC}; height in m"
+"""Unit of a logarithmic position of an object."""
+
 
 def require_transport(*, speed: float, target_distance_power: float, goal_positions: str) -> None:
     """Check the arguments of rewards and goals.

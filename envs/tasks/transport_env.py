@@ -4,16 +4,25 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from torch import Tensor
 
 from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.ideal import Reach, transport_reach
+from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.rewards import training_reward
-from torchrl_mcp.envs.tasks.transport import goal_layout, goal_mirror, pointers, require_transport
+from torchrl_mcp.envs.tasks.transport import (
+    LOGARITHMIC,
+    POSITION_UNIT,
+    goal_layout,
+    goal_mirror,
+    pointers,
+    require_transport,
+)
 
 
 class Transport(PDCharacterEnv):
@@ -40,6 +49,8 @@ class Transport(PDCharacterEnv):
     """
 
     num_reward_terms = 4
+
+    units: Mapping[str, str] = MappingProxyType({**UNITS, "waypoint": LOGARITHMIC})
 
     objects: ClassVar[Mapping[str, int]]
     """The objects in the order of the scene, and how many numbers the goal has of each."""
@@ -72,6 +83,8 @@ class Transport(PDCharacterEnv):
         self.speed, self.target_distance_power, self.success_reward = speed, target_distance_power, success_reward
         self.goal_positions, self.waypoint = goal_positions, waypoint
         self.goal_layout = goal_layout(self.objects, waypoint)
+        if goal_positions == "logarithmic":
+            self.units = {**self.units, **dict.fromkeys((f"{name}.position" for name in self.objects), POSITION_UNIT)}
         super().__init__(character, num_envs, **kwargs)
 
     @abstractmethod

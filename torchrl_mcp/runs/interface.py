@@ -1,21 +1,13 @@
 """What a program without this library needs to run an exported policy: names, units, time steps and the scene."""
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-
-UNITS = {
-    "root_height": "m",
-    "position": "m",
-    "orientation": "quaternion w x y z",
-    "linear_velocity": "m/s",
-    "angular_velocity": "rad/s",
-}
-"""Units of the quantities of a character's state."""
 
 
 def interface(env: CharacterEnv) -> dict[str, str]:
@@ -31,41 +23,37 @@ def interface(env: CharacterEnv) -> dict[str, str]:
     described: dict[str, Any] = {
         "control_timestep": env.control_timestep,
         "physics_timestep": env.simulation.model.opt.timestep,
+        "observation": _entries(env, "observation", env.observation_layout),
+        "goal": _entries(env, "goal", env.goal_layout),
         "action": _action(env),
-        "goal": _goal(env),
+        "scene": env.scene,
     }
     if isinstance(env, PDCharacterEnv):
-        described |= {
-            "character": env.character.name,
-            "feet": list(env.character.feet),
-            "scene": env.scene,
-            "observation": [
-                {"name": name, "size": place.stop - place.start, "unit": UNITS[name.rpartition(".")[2]]}
-                for name, place in env.observation_layout.items()
-            ],
-        }
+        described |= {"character": env.character.name, "feet": list(env.character.feet)}
     return {key: json.dumps(value) for key, value in described.items()}
 
 
+def _entries(env: CharacterEnv, key: str, layout: Mapping[str, slice]) -> list[dict[str, Any]]:
+    """Name, size and unit of each entry of an input; an input without a layout is one entry."""
+    layout = layout or {key: slice(0, env.observation_spec[key].shape[-1])}
+    return [
+        {
+            "name": name,
+            "size": place.stop - place.start,
+            "unit": env.units.get(name, env.units.get(name.rpartition(".")[2], "")),
+        }
+        for name, place in layout.items()
+    ]
+
+
 def _action(env: CharacterEnv) -> list[dict[str, Any]]:
-    """Name, centre and scale of each actuator."""
+    """Name, unit, centre and scale of each actuator."""
     model = env.simulation.model
     zero = torch.zeros(env.num_envs, model.nu, dtype=torch.float64, device=env.device)
     centre = env._controls(zero)
     scale = env._controls(zero + 1) - centre
-    unit = "rad" if isinstance(env, PDCharacterEnv) else "ctrl"
+    unit = "rad" if isinstance(env, PDCharacterEnv) else "control"
     return [
         {"name": model.actuator(index).name, "unit": unit, "centre": middle, "scale": half}
         for index, (middle, half) in enumerate(zip(centre.expand_as(zero)[0].tolist(), scale[0].tolist(), strict=True))
     ]
-
-
-def _goal(env: CharacterEnv) -> list[dict[str, Any]]:
-    """Name, size and unit of each entry of the goal; tasks without a layout have one entry."""
-    size = env.observation_spec["goal"].shape[-1]
-    layout: dict[str, slice] = getattr(env, "goal_layout", {})
-    named = min((place.start for place in layout.values()), default=size)
-    first: dict[str, int] = getattr(env, "goal_sizes", {"goal": named})
-    sizes = {**first, **{name: place.stop - place.start for name, place in layout.items()}}
-    units = getattr(env, "goal_units", {})
-    return [{"name": name, "size": sizes[name], "unit": units.get(name, "")} for name in sizes if sizes[name]]

@@ -194,9 +194,9 @@ def require_entry(env: CharacterEnv, name: str) -> slice:
     Raises:
         ValueError: If the goal has no such entry.
     """
-    layout: dict[str, slice] = getattr(env, "goal_layout", {})
-    if name not in layout:
-        known = f"has {', '.join(layout)}" if layout else "is one entry: leave it out"
+    layout = env.goal_layout
+    if name not in layout or len(layout) == 1:
+        known = f"has {', '.join(layout)}" if len(layout) > 1 else "is one entry: leave it out"
         raise ValueError(f"transfer.goal_entry={name} is no entry of the task's goal, which {known}")
     return layout[name]
 

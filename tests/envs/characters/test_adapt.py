@@ -377,6 +377,24 @@ def test_a_joint_on_which_no_actuator_acts_stays_passive_with_its_spring():
     assert (knee.stiffness[0], knee.damping[0], knee.armature[0]) == (7, 0.2, 0)
 
 
+def test_a_gain_alone_leaves_a_joint_passive_and_says_so():
+    drives = adapted(with_tendon(HIPS), gains={".": 50.0}).drives
+    assert (drives["right_shin"].torque_from, drives["right_thigh"].gain) == ("passive", 50)
+    assert "--torque" in drives["right_shin"].remark
+    assert "--torque" not in drives["right_thigh"].remark
+
+
+def test_a_hinge_without_a_motor_beside_one_with_a_motor_is_named():
+    hip = '<joint name="right_hip"'
+    text = ROBOT.format(**PLAIN | {"actuators": HIPS})
+    text = text.replace(hip, f'<joint name="right_roll" axis="1 0 0" range="-0.3 0.3"/>{hip}')
+    drives = adapted(
+        mujoco.MjModel.from_xml_string(text.replace("<keyframe>", "<!--").replace("</keyframe>", "-->"))
+    ).drives
+    assert "right_roll" in drives["right_thigh"].remark
+    assert "right_hip" not in drives["right_thigh"].remark
+
+
 def test_a_torque_that_is_given_makes_a_passive_joint_driven():
     drives = adapted(with_tendon(HIPS), torques={"knee": 50.0}).drives
     assert {name: drive.torque for name, drive in drives.items() if "shin" in name} == {
@@ -416,6 +434,17 @@ def test_the_same_bodies_are_feet_whatever_the_size(size):
         lengths *= size
     model.qpos0[:3] *= size
     assert adapted(model).feet == ("right_shin", "left_shin")
+
+
+def test_legs_that_end_a_little_above_the_others_have_feet():
+    spec = mujoco.MjSpec.from_string(FIXED_DOG)
+    float_trunk(spec)
+    for side in ("hr", "hl"):
+        spec.body(f"{side}_leg").pos[2] = 0.025  # the trunk is 0.3 m above the ground
+    assert sorted(adapted(spec.compile()).feet) == ["fl_leg", "fr_leg", "hl_leg", "hr_leg"]
+    for side in ("hr", "hl"):
+        spec.body(f"{side}_leg").pos[2] = 0.05
+    assert sorted(adapted(spec.compile()).feet) == ["fl_leg", "fr_leg"]
 
 
 def test_a_limb_has_at_most_two_feet_and_a_tail_is_none():
