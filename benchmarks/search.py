@@ -236,13 +236,15 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
         sampler=optuna.samplers.TPESampler(seed=SEEDS[0], multivariate=True, n_startup_trials=6),
         pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0),
     )
-    if not study.trials:
-        for known in ("default", "large"):
-            study.enqueue_trial({}, user_attrs={"known": known})
     for trial in study.trials:
         if trial.state == optuna.trial.TrialState.RUNNING:  # of an interrupted search
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
-            study.enqueue_trial(trial.params, user_attrs=trial.user_attrs)
+            if trial.params:
+                study.enqueue_trial(trial.params)
+    tried = {trial.user_attrs.get("known") for trial in study.trials if trial.state.name != "FAIL"}
+    for known in ("default", "large"):
+        if known not in tried:
+            study.enqueue_trial({}, user_attrs={"known": known})
     table = Table(results / f"{name}.csv")
 
     def objective(trial: Any) -> float:
