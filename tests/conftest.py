@@ -76,7 +76,8 @@ def _another_processor(request, monkeypatch):
             return state
 
         monkeypatch.setattr(EnvBase, "reset", perturbed)
-    with torch.autocast("cpu", torch.bfloat16, enabled=request.config.getoption("bfloat16")):
+    # Without the cache, which would keep copies of the weights from before training or loading.
+    with torch.autocast("cpu", torch.bfloat16, enabled=request.config.getoption("bfloat16"), cache_enabled=False):
         yield
 
 
