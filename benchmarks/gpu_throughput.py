@@ -72,7 +72,7 @@ def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, 
     steps = STEPS * iterations
     seconds = play(source.env, steps)
     record = Record()
-    trainer.metrics_writer = record  # type: ignore[assignment]
+    trainer.folder.metrics = record  # type: ignore[assignment]
     trainer.save = lambda: None  # type: ignore[method-assign]
     trainer.run()
     training = sum(samples / speed for speed in record.speeds[1:])

@@ -119,7 +119,7 @@ def sections(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
     torch.set_num_threads(threads)
     trainer = make_trainer(num_envs, threads, workers)
     record = Record()
-    trainer.metrics_writer = record  # type: ignore[assignment]
+    trainer.folder.metrics = record  # type: ignore[assignment]
     trainer.save = lambda: None  # type: ignore[method-assign]
     trainer.run()
     rows = record.rows[1:]
@@ -151,12 +151,12 @@ def count() -> dict[str, float]:
     trainer, counts = make_trainer(MINIBATCH, 1, 0), {}
     batch = trainer.source.env.fake_tensordict().expand(MINIBATCH).clone()
     with torch.no_grad(), Operations() as operations, FlopCounterMode(display=False) as flops:
-        trainer.actor.policy(batch)
+        trainer.agent.actor.policy(batch)
     counts |= {"forward_operations": operations.count, "forward_flops": flops.get_total_flops() / MINIBATCH}
     batch = batch.update({"advantage": torch.zeros(MINIBATCH, 1), "value_target": torch.zeros(MINIBATCH, 1)})
     with Operations() as operations, FlopCounterMode(display=False) as flops:
-        for name in trainer.optimizers:
-            trainer._learn(name, batch, [torch.arange(MINIBATCH)])
+        for name in trainer.update.objective.optimizers:
+            trainer.update._learn(name, batch, [torch.arange(MINIBATCH)])
     return counts | {"step_operations": operations.count, "step_flops": flops.get_total_flops() / MINIBATCH}
 
 

@@ -97,7 +97,7 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
     source = build.make_source(cfg)
     trainer = build.make_trainer(cfg, build.make_agent(cfg, source.env), source, Path(cfg.run_dir))
     turns = Turns()
-    trainer.metrics_writer.loggers = [turns]
+    trainer.folder.metrics.loggers = [turns]
     turns.begin()
     trainer.run()
 

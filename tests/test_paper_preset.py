@@ -102,13 +102,13 @@ def built(request, tmp_path_factory):
 
 def step_size(trainer, name):
     """How far the trainer goes along a gradient of 1000 at the first step, for each unit of it; if it trains that."""
-    if name not in trainer.optimizers:
+    if name not in trainer.update.objective.optimizers:
         return None
-    (group,) = trainer.optimizers[name].param_groups
+    (group,) = trainer.update.objective.optimizers[name].param_groups
     before = [parameter.detach().clone() for parameter in group["params"]]
     for parameter in group["params"]:
         parameter.grad = torch.full_like(parameter, 1000.0)
-    trainer._step(trainer.optimizers[name])
+    trainer.update._step(trainer.update.objective.optimizers[name])
     gone = {round((old - new).median().item() / 1000, 9) for old, new in zip(before, group["params"], strict=True)}
     assert max(gone) - min(gone) < 1e-3 * max(gone)
     return max(gone)
@@ -118,20 +118,24 @@ def test_what_one_optimiser_trains_the_other_s_loss_does_not_read(built):
     """They learn at the same time."""
     *_, trainer = built
     for name, other in (("actor", "critic"), ("critic", "actor")):
-        groups = trainer.optimizers[name].param_groups if name in trainer.optimizers else ()
+        groups = (
+            trainer.update.objective.optimizers[name].param_groups
+            if name in trainer.update.objective.optimizers
+            else ()
+        )
         trained = {parameter for group in groups for parameter in group["params"]}
-        assert trained.isdisjoint(trainer.losses[other].parameters())
+        assert trained.isdisjoint(trainer.update.objective.losses[other].parameters())
 
 
 def decays(trainer):
-    gae = getattr(trainer.advantages, "gae", None)
-    estimator = gae.estimator if gae else trainer.advantages
+    gae = getattr(trainer.update.objective.advantages, "gae", None)
+    estimator = gae.estimator if gae else trainer.update.objective.advantages
     return float(estimator.lmbda), float(estimator.gamma)
 
 
 def skills(trainer):
     """How many primitives, options or latent numbers there are, by the sizes of the networks."""
-    parts = trainer.parts
+    parts = trainer.agent.parts
     if "decoder" in parts:
         return parts["decoder"].body[0].in_features - parts["observation_normaliser"].mean.numel()
     if "primitives" in parts:
@@ -149,9 +153,17 @@ def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
     assert lmbda == pytest.approx(0.5 if method == "option_critic" else 0.95)  # Table 9 has none
     assert gamma == pytest.approx(DISCOUNT[stage])
     steps_per_sample = 30 if (method, stage) == ("hierarchical", "transfer") else 1  # Table 8: a sample is a choice
-    assert (trainer.frames_per_batch / steps_per_sample, trainer.minibatch_size) == (table["Batch Size"], 256)
-    assert (trainer.num_epochs, trainer.schedule, trainer.autocast, trainer.warmup_batches) == (1, None, False, 0)
-    for optimizer in trainer.optimizers.values():
+    assert (trainer.settings.frames_per_batch / steps_per_sample, trainer.settings.minibatch_size) == (
+        table["Batch Size"],
+        256,
+    )
+    assert (
+        trainer.settings.num_epochs,
+        trainer.update.objective.schedule,
+        trainer.settings.autocast,
+        trainer.settings.warmup_batches,
+    ) == (1, None, False, 0)
+    for optimizer in trainer.update.objective.optimizers.values():
         (group,) = optimizer.param_groups
         assert isinstance(optimizer, torch.optim.SGD)
         assert (group["momentum"], group["weight_decay"], group["nesterov"]) == (table["SGD Momentum"], 0, False)
@@ -162,11 +174,13 @@ def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
     else:
         assert [step_size(trainer, "actor")] == [pytest.approx(step, rel=0.01) for step in steps]
     if "PPO Clip Threshold" in table:
-        assert float(trainer.losses["actor"].clip_epsilon) == pytest.approx(table["PPO Clip Threshold"])
+        assert float(trainer.update.objective.losses["actor"].clip_epsilon) == pytest.approx(
+            table["PPO Clip Threshold"]
+        )
     if "Termination Cost" in table:
-        assert trainer.advantages.termination_cost == table["Termination Cost"]
+        assert trainer.update.objective.advantages.termination_cost == table["Termination Cost"]
     if "beta KL Regularizer" in table:
-        assert trainer.losses["actor"].kl_coeff == table["beta KL Regularizer"]
+        assert trainer.update.objective.losses["actor"].kl_coeff == table["beta KL Regularizer"]
     for row in ("k Primitives", "k Options", "w Latent Size"):
         if row in table:
             assert skills(trainer) == table[row]
@@ -175,7 +189,7 @@ def test_the_preset_builds_a_trainer_with_the_table_of_each_method(built):
 def test_the_preset_builds_the_layers_of_appendix_e(built):
     method, stage, trainer = built
     for part, widths in {**LAYERS[method, stage], "critic": {1024, 512}}.items():
-        linear = [layer for layer in trainer.parts[part].modules() if isinstance(layer, torch.nn.Linear)]
+        linear = [layer for layer in trainer.agent.parts[part].modules() if isinstance(layer, torch.nn.Linear)]
         hidden = {layer.out_features for layer in linear if layer.out_features > 34}
         assert hidden == widths, part
 

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from torch import nn
 
 from torchrl_mcp.objectives import MirroredSamples, SymmetryLoss
 from torchrl_mcp.runs import build
@@ -41,11 +40,11 @@ def collect(agent, trainer):
 @pytest.mark.parametrize("overrides", MIRRORED.values(), ids=MIRRORED)
 def test_half_of_the_samples_are_mirror_images_to_learn_from_like_the_others(overrides, tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=augment", *overrides)
-    assert isinstance(trainer.advantages, MirroredSamples)
-    trainer.advantages.tolerance = math.inf
+    assert isinstance(trainer.update.objective.advantages, MirroredSamples)
+    trainer.update.objective.advantages.tolerance = math.inf
     before = collect(agent, trainer)
-    after = trainer.advantages(before.clone())
-    plain = trainer.advantages.advantages(before.clone())
+    after = trainer.update.objective.advantages(before.clone())
+    plain = trainer.update.objective.advantages.advantages(before.clone())
     mirrors = trainer.source.env.mirrors()
     mirrored = (after["action"] != before["action"]).any(-1)  # bodies at rest are their own images
     assert 4 <= mirrored.sum() <= 28  # of 32
@@ -71,7 +70,7 @@ def test_a_batch_may_have_no_image(tmp_path):
     single = collect(agent, trainer)[:1, :1]
     replaced = 0
     for _ in range(20):
-        after = trainer.advantages(single.clone())
+        after = trainer.update.objective.advantages(single.clone())
         replaced += not torch.equal(after["action"], single["action"])
     assert 0 < replaced < 20
 
@@ -84,8 +83,8 @@ def test_a_sample_whose_image_the_policy_finds_all_but_impossible_is_not_replace
     for key in ("observation", "goal", "action"):
         image[key] = mirrors[key](image[key])
     loss = before[actor.log_prob] - actor.trained.get_dist(image).log_prob(image["action"])
-    trainer.advantages.tolerance = limit = loss.median().item()
-    after = trainer.advantages(before.clone())
+    trainer.update.objective.advantages.tolerance = limit = loss.median().item()
+    after = trainer.update.objective.advantages(before.clone())
     mirrored = (after["action"] != before["action"]).any(-1)
     assert mirrored.any()
     assert (loss[mirrored] <= limit).all()
@@ -96,16 +95,16 @@ def test_a_sample_whose_image_the_policy_finds_all_but_impossible_is_not_replace
 @pytest.mark.parametrize("overrides", MIRRORED.values(), ids=MIRRORED)
 def test_the_penalty_is_the_squared_distance_of_mean_actions_from_their_mirror_images(overrides, tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=loss", *overrides)
-    samples = trainer.advantages(collect(agent, trainer)).flatten()
+    samples = trainer.update.objective.advantages(collect(agent, trainer)).flatten()
     mirrors, actor = trainer.source.env.mirrors(), agent.actor
     image = samples.clone()
     for key in ("observation", "goal"):
         image[key] = mirrors[key](image[key])
-    if "primitives" in trainer.frozen:
+    if "primitives" in trainer.agent.frozen:
         image.update(actor.policy(image.select("observation", "goal")).select(*actor.stored))
     means = [actor.trained.get_dist(side).mean for side in (samples, image)]
     expected = 4.0 * (means[0] - mirrors["action"](means[1])).square().sum(-1).mean()
-    report = trainer.losses["actor"](samples)
+    report = trainer.update.objective.losses["actor"](samples)
     torch.testing.assert_close(report["loss_symmetry"], expected, atol=1e-6, rtol=1e-3)
     assert report["loss_symmetry"] > 0
     parameters = [p for p in actor.trained.parameters() if p.requires_grad]
@@ -114,12 +113,12 @@ def test_the_penalty_is_the_squared_distance_of_mean_actions_from_their_mirror_i
         for parameter, slope in zip(parameters, gradient, strict=True):
             if slope is not None:
                 parameter -= 1e-4 * slope
-    assert trainer.losses["actor"](samples)["loss_symmetry"] < report["loss_symmetry"]
+    assert trainer.update.objective.losses["actor"](samples)["loss_symmetry"] < report["loss_symmetry"]
 
 
 def test_a_symmetric_policy_pays_nothing(tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=loss", "method=scratch", "task=heading")
-    samples = trainer.advantages(collect(agent, trainer)).flatten()
+    samples = trainer.update.objective.advantages(collect(agent, trainer)).flatten()
     mirrors, policy = trainer.source.env.mirrors(), agent.parts["policy"]
     for key in ("observation", "goal"):  # statistics of a symmetric policy are symmetric
         normaliser = agent.parts[f"{key}_normaliser"]
@@ -133,13 +132,13 @@ def test_a_symmetric_policy_pays_nothing(tmp_path):
         return (loc + mirrors["action"](image)) / 2, scale
 
     policy.forward = forward
-    assert trainer.losses["actor"](samples)["loss_symmetry"] < 1e-9
+    assert trainer.update.objective.losses["actor"](samples)["loss_symmetry"] < 1e-9
 
 
 def test_reflections_move_with_the_loss_and_are_no_part_of_its_state(tmp_path):
     agent, trainer = trainer_of(tmp_path, "symmetry=none", "method=scratch", "task=heading")
     mirrors = trainer.source.env.mirrors()
-    loss = SymmetryLoss(nn.Identity(), agent.actor, mirrors, coeff=1.0)
+    loss = SymmetryLoss(trainer.update.objective.losses["actor"], agent.actor, mirrors, coeff=1.0)
     assert not [key for key in loss.state_dict() if "mirror" in key]
     loss.to("meta")
     assert {buffer.device.type for mirror in mirrors.values() for buffer in mirror.buffers()} == {"meta"}

@@ -64,7 +64,7 @@ def test_every_hidden_layer_of_every_method_is_watched(method, tmp_path):
     outputs = [module for name, module in agent.parts.named_modules() if name.rpartition(".")[2] == "output"]
     heads = len(outputs) + 1  # the critic's
     injections = "goal_input" in agent.parts  # added before the rectifier of another layer
-    assert len(trainer.dead_units.layers) == len(layers) - heads - injections
+    assert len(trainer.update.dead_units.layers) == len(layers) - heads - injections
 
 
 def test_training_records_the_share_of_every_network(tmp_path):

@@ -15,10 +15,11 @@ from smoke import SMOKE, configure, final_parts, rows
 
 from torchrl_mcp.envs import CharacterEnv, Heading
 from torchrl_mcp.runs import build, experiment, policies
-from torchrl_mcp.training import checkpoint, run_folder, trainer
+from torchrl_mcp.training import checkpoint, run_folder, update
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.threads import threads
 from torchrl_mcp.training.trainer import Trainer
+from torchrl_mcp.training.update import Update
 
 ONE_BATCH = "training.total_frames=128"
 
@@ -61,7 +62,7 @@ def test_the_trajectory_source_is_stopped_when_a_run_fails(tmp_path, monkeypatch
 
     stopped, stop = [], LocalSource.stop
     monkeypatch.setattr(LocalSource, "stop", lambda source: stopped.append(stop(source)))
-    monkeypatch.setattr(Trainer, "_update", fail)
+    monkeypatch.setattr(Update, "__call__", fail)
     with pytest.raises(failure):
         experiment.train(configure(tmp_path / "run"))
     assert len(stopped) == 1
@@ -167,7 +168,7 @@ def test_a_frozen_part_that_changes_stops_the_run(tmp_path, pretrained, monkeypa
 
     def meddle(trainer, batch):
         real(trainer, batch)
-        trainer.parts["primitives"].output.bias.data[0, 0] += 1e-6
+        trainer.agent.parts["primitives"].output.bias.data[0, 0] += 1e-6
 
     monkeypatch.setattr(Trainer, "_update_normalisers", meddle)
     with pytest.raises(RuntimeError, match="primitives"):
@@ -178,14 +179,14 @@ def test_collection_leaves_the_processors_to_physics_and_the_update_has_them_all
     numbers = {"step": set(), "update": set()}
 
     def watch(section, method):
-        def watched(*args):
+        def watched(*args, **kwargs):
             numbers[section].add(torch.get_num_threads())
-            return method(*args)
+            return method(*args, **kwargs)
 
         return watched
 
     monkeypatch.setattr(CharacterEnv, "_step", watch("step", CharacterEnv._step))
-    monkeypatch.setattr(Trainer, "_update", watch("update", Trainer._update))
+    monkeypatch.setattr(Update, "__call__", watch("update", Update.__call__))
     gc.collect()  # finalisers of TorchRL's collectors, which other tests left, set the number of threads
     with threads(2):
         experiment.train(configure(tmp_path, ONE_BATCH))
@@ -200,7 +201,7 @@ def test_actor_and_critic_learn_the_same_at_the_same_time_as_in_turn_to_the_bit(
     with threads(2):
         experiment.train(configure(tmp_path / "together", *settings))
         with monkeypatch.context() as patch:
-            patch.setattr(trainer, "side_by_side", in_turn)
+            patch.setattr(update, "side_by_side", in_turn)
             experiment.train(configure(tmp_path / "in_turn", *settings))
     assert rows(tmp_path / "together") == rows(tmp_path / "in_turn")
     expected = final_parts(tmp_path / "in_turn")

@@ -7,12 +7,16 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_mcp.objectives import ActorLoss
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
+from torchrl_mcp.training.update import Objective, Update
 
 
-class Pull(nn.Module):
+class Pull(ActorLoss):
     """A loss of known gradient, 3 + 4 on its only parameter, which remembers the samples that it sees."""
+
+    out_keys = ("loss_one", "loss_other", "mean_ratio", "kl_approx", "entropy")
 
     def __init__(self):
         super().__init__()
@@ -27,7 +31,7 @@ class Pull(nn.Module):
 
 
 def updated(folder, max_grad_norm):
-    """A trainer and both losses after an update by plain gradient descent with step size 0.1, and its metrics."""
+    """Both losses after an update by plain gradient descent with step size 0.1, its divergences, and its metrics."""
     settings = ["preset=smoke", "method=scratch", "task=holdout", "logger=none", "num_threads=1", f"run_dir={folder}"]
     settings += ["training.frames_per_batch=32", "training.minibatch_size=8", "training.num_epochs=3"]
     cfg = compose_run(*settings, f"objective.max_grad_norm={max_grad_norm}")
@@ -35,37 +39,56 @@ def updated(folder, max_grad_norm):
     source = build.make_source(cfg)
     agent = build.make_agent(cfg, source.env)
     trainer = build.make_trainer(cfg, agent, source, folder)
-    trainer.losses = {"actor": Pull(), "critic": Pull()}
-    trainer.optimizers = {name: torch.optim.SGD(loss.parameters(), lr=0.1) for name, loss in trainer.losses.items()}
-    trainer.schedule = SimpleNamespace(told=[])
-    trainer.schedule.step = trainer.schedule.told.append
+    losses = {"actor": Pull(), "critic": Pull()}
+    optimizers = {name: torch.optim.SGD(loss.parameters(), lr=0.1) for name, loss in losses.items()}
+    divergences = []
+    objective = Objective(Numbered(), losses, optimizers, SimpleNamespace(step=divergences.append))
     with torch.no_grad():
         batch = source.env.rollout(8, agent.actor.policy, break_when_any_done=False)
-    samples = trainer.advantages(batch)
-    samples["advantage"] = torch.arange(32.0).view(4, 8, 1)
-    return trainer, trainer._update(samples, warming_up=False)
+    return losses, divergences, Update(agent, objective, trainer.settings)(batch, warming_up=False)
+
+
+class Numbered:
+    """An estimator whose advantages tell the samples apart."""
+
+    out_keys = ("advantage",)
+
+    def __call__(self, batch):
+        batch["advantage"] = torch.arange(32.0).view(4, 8, 1)
+        return batch
 
 
 @pytest.mark.parametrize(("limit", "slope"), [("null", 7.0), (1.0, 1.0)])
 def test_an_update_minimises_every_term_of_a_loss_once_per_minibatch_and_epoch_with_clipped_gradients(
     tmp_path, limit, slope
 ):
-    trainer, metrics = updated(tmp_path, limit)
-    for name, loss in trainer.losses.items():
+    losses, _, metrics = updated(tmp_path, limit)
+    for name, loss in losses.items():
         assert loss.weight.item() == pytest.approx(-0.1 * slope * 3 * 4, rel=1e-4)
         assert metrics[f"loss/{name}_grad_norm"] == pytest.approx(7.0)  # before clipping
 
 
 def test_every_epoch_sees_every_sample_once_in_an_order_of_its_own(tmp_path):
-    trainer, _ = updated(tmp_path, 1.0)
-    for loss in trainer.losses.values():
+    losses, _, _ = updated(tmp_path, 1.0)
+    for loss in losses.values():
         epochs = [loss.seen[start : start + 32] for start in (0, 32, 64)]
         assert [sorted(epoch) for epoch in epochs] == [list(range(32))] * 3
         assert len({tuple(epoch) for epoch in [*epochs, range(32)]}) == 4
 
 
 def test_the_step_size_follows_the_divergence_of_the_last_epoch(tmp_path):
-    trainer, metrics = updated(tmp_path, 1.0)
+    _, divergences, metrics = updated(tmp_path, 1.0)
     # E[r - 1 - log r]: 0.2 less 0.1 for each of the calls so far, of which 9 to 12 are the last epoch's.
     assert metrics["loss/kl"] == pytest.approx(0.1 * (9 + 10 + 11 + 12) / 4, rel=1e-4)
-    assert trainer.schedule.told == [metrics["loss/kl"]]
+    assert divergences == [metrics["loss/kl"]]
+
+
+def test_a_loss_that_does_not_declare_its_reports_is_refused_by_name_before_training():
+    class Silent(nn.Module):
+        out_keys = ("loss_objective", "kl_approx")
+
+    losses = {"actor": Silent(), "critic": Pull()}
+    optimizers = {"actor": None, "critic": None}
+    with pytest.raises(ValueError, match=r"Silent.*mean_ratio"):
+        Objective(Numbered(), losses, optimizers, None)
+    Objective(Numbered(), losses, {"critic": None}, None)  # of a frozen actor

@@ -1,5 +1,6 @@
 """Losses and estimators that TorchRL does not have."""
 
+from torchrl_mcp.objectives.actor_loss import ActorLoss
 from torchrl_mcp.objectives.advantages import Advantages
 from torchrl_mcp.objectives.latent import LatentPPOLoss
 from torchrl_mcp.objectives.option_critic import OptionAdvantages, OptionCriticLoss, OptionValueLoss
@@ -9,6 +10,7 @@ from torchrl_mcp.objectives.symmetry import MirroredSamples, SymmetryLoss
 from torchrl_mcp.objectives.values import ValueLoss
 
 __all__ = [
+    "ActorLoss",
     "Advantages",
     "BoundedClipPPOLoss",
     "LatentPPOLoss",

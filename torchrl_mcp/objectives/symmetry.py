@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.methods.options import OptionActor
+from torchrl_mcp.objectives.actor_loss import ActorLoss
 
 
 class MirroredSamples:
@@ -63,7 +64,7 @@ class MirroredSamples:
         return samples
 
 
-class SymmetryLoss(nn.Module):
+class SymmetryLoss(ActorLoss):
     r"""An actor's loss plus a penalty on mean actions that are not the mirror images of those in mirrored states.
 
     .. math:: L + c \, \mathbb{E} \left\| \mu(s, g) - M_a \, \mu(M_s s, M_g g) \right\|^2
@@ -81,10 +82,13 @@ class SymmetryLoss(nn.Module):
         Yu, Turk and Liu, *Learning Symmetric and Low-Energy Locomotion*, 2018, Eq. 4. https://arxiv.org/abs/1801.08093
     """
 
-    def __init__(self, loss: nn.Module, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:
+    def __init__(self, loss: ActorLoss, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:
         super().__init__()
         _require_actions(actor)
-        self.loss, self.actor, self.coeff = loss, actor, coeff
+        self.loss = loss
+        self.actor = actor
+        self.coeff = coeff
+        self.out_keys = [*loss.out_keys, "loss_symmetry"]
         self.mirrors = nn.ModuleDict(dict(mirrors))
         # Random keys, such as the noise of a latent variable, are the same on both sides: only `trained` reads them.
         self._network: Any = actor.trained if actor.drawn else actor.policy

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -11,12 +10,11 @@ from typing import Any, cast
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Compose
 
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.methods.actor import Actor, Sizes
+from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
@@ -27,25 +25,10 @@ from torchrl_mcp.runs.publish import load_kept
 from torchrl_mcp.runs.requirements import require_arguments, require_entry, require_environment, require_files
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
-from torchrl_mcp.training.metrics import MetricsWriter, begin_after
-from torchrl_mcp.training.trainer import Trainer
+from torchrl_mcp.training.metrics import begin_after
+from torchrl_mcp.training.trainer import RunFolder, Trainer
 from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts, widen_goal
-
-
-@dataclass(frozen=True)
-class Agent:
-    """A method's networks for the sizes of an environment."""
-
-    parts: nn.ModuleDict
-    actor: Actor
-    critic: TensorDictModuleBase
-    frozen: FrozenParts
-
-    @property
-    def spare_parts(self) -> set[str]:
-        """Names of the parts that act in no state: the critic, unless its values choose the option."""
-        acting = {id(parameter) for parameter in self.actor.policy.parameters()}
-        return {"critic"} if acting.isdisjoint(map(id, self.parts["critic"].parameters())) else set()
+from torchrl_mcp.training.update import Agent, Objective, PPOSettings
 
 
 def make_run(cfg: DictConfig, folder: Path, initial: Path | None = None) -> Trainer:
@@ -169,41 +152,39 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
     ``training.frames_per_batch`` by this factor.
     """
     assert isinstance(cfg.autocast, bool)
+    numbers = dict(cfg.training)
+    numbers["frames_per_batch"] *= cfg.get("batch_factor", 1)
+    settings = PPOSettings(
+        **numbers,
+        max_grad_norm=cfg.objective.max_grad_norm,
+        checkpoint_interval=cfg.checkpoint_interval,
+        autocast=cfg.autocast,
+    )
+    objective = make_objective(cfg, agent, source.env)
+    run_folder = RunFolder(folder, places.stored(cfg), keep_checkpoints=cfg.keep_checkpoints)
+    return Trainer(source, agent, objective, settings, run_folder, progress_bar=cfg.progress_bar)
+
+
+def make_objective(cfg: DictConfig, agent: Agent, env: CharacterEnv | TransformedCharacterEnv) -> Objective:
+    """Return what the agent optimises, and its optimisers; of a frozen actor there is none."""
+    actor_loss = instantiate(cfg.objective.loss)(agent.actor.trained)
+    actor_loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
+    advantages = instantiate(cfg.objective.advantages)(agent.critic)
+    if symmetry := instantiate(cfg.get("symmetry")):
+        mirrors = nn.ModuleDict(env.mirrors()).to(cfg.device)
+        if "advantages" in symmetry:
+            advantages = symmetry["advantages"](advantages, agent.actor, mirrors)
+        if "loss" in symmetry:
+            actor_loss = symmetry["loss"](actor_loss, agent.actor, mirrors)
+    losses = {"actor": actor_loss, "critic": instantiate(cfg.objective.value_loss)(agent.critic)}
     trainable = {
         "actor": [p for p in agent.actor.trained.parameters() if p.requires_grad],
         "critic": list(agent.parts["critic"].parameters()),
     }
     optimizers = {name: instantiate(cfg.optimizer[name])(p) for name, p in trainable.items() if p}
-    loss = instantiate(cfg.objective.loss)(agent.actor.trained)
-    loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
-    advantages = instantiate(cfg.objective.advantages)(agent.critic)
-    if symmetry := instantiate(cfg.get("symmetry")):
-        mirrors = nn.ModuleDict(source.env.mirrors()).to(cfg.device)
-        if "advantages" in symmetry:
-            advantages = symmetry["advantages"](advantages, agent.actor, mirrors)
-        if "loss" in symmetry:
-            loss = symmetry["loss"](loss, agent.actor, mirrors)
-    training = {key: value for key, value in cfg.training.items() if key != "num_envs"}
-    training["frames_per_batch"] *= cfg.get("batch_factor", 1)
-    return Trainer(
-        source=source,
-        parts=agent.parts,
-        actor=agent.actor,
-        critic=agent.critic,
-        losses={"actor": loss, "critic": instantiate(cfg.objective.value_loss)(agent.critic)},
-        advantages=advantages,
-        optimizers=optimizers,
-        frozen=agent.frozen,
-        metrics_writer=MetricsWriter(folder),
-        checkpoints=checkpoint.rotation(folder, cfg.keep_checkpoints),
-        config=places.stored(cfg),
-        max_grad_norm=cfg.objective.max_grad_norm,
-        step_size_schedule=instantiate(cfg.optimizer.schedule),
-        autocast=cfg.autocast,
-        device=cfg.device,
-        checkpoint_interval=cfg.checkpoint_interval,
-        progress_bar=cfg.progress_bar,
-        **training,
+    schedule = instantiate(cfg.optimizer.schedule)
+    return Objective(
+        advantages, losses, optimizers, schedule(optimizers["actor"]) if schedule and "actor" in optimizers else None
     )
 
 
@@ -216,7 +197,7 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
         begin_after(logger, trainer.progress.frames)
     if cfg.get("record_interval") is None:
         return loggers
-    actor, make_film_env = trainer.actor, partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
+    actor, make_film_env = trainer.agent.actor, partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
     num_options = actor.num_options if isinstance(actor, OptionActor) else 0
     recorder = instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=num_options)
     return [*loggers, recorder]

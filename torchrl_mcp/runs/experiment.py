@@ -95,7 +95,7 @@ def _train(plan: Plan) -> Path:
         build.make_env(cfg, num_envs=1, seed=cfg.evaluation.seed, **cfg.evaluation.environment).close()
     trainer = build.make_run(cfg, plan.folder, plan.initial)
     trainer.save()
-    records.begin(plan.folder, trainer.config, precision)
+    records.begin(plan.folder, trainer.folder.config, precision)
     return _finish(trainer, cfg, plan.folder)
 
 
@@ -127,7 +127,7 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
         trainer.restore(path)
     else:  # the environments had not been reset yet, so the checkpoint has no state of them
         trainer = build.make_run(cfg, folder, initial_networks(cfg))
-        trainer.metrics_writer.rewind(0)
+        trainer.folder.metrics.rewind(0)
     for damaged in saved[: saved.index(path)]:
         print(f"{damaged} is damaged: the run goes on from {path.name}, the newest that is intact", flush=True)
         checkpoint.set_aside(damaged)
@@ -136,7 +136,7 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
 
 def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> Path:
     """Train to the end, evaluate the policy, and return the folder."""
-    trainer.metrics_writer.loggers = build.make_loggers(cfg, trainer, folder)
+    trainer.folder.metrics.loggers = build.make_loggers(cfg, trainer, folder)
     trainer.run()
     if not (folder / CONFIG).is_file():
         raise FileNotFoundError(f"{folder} was removed while the run was at work: what it has learnt is lost")
