@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -22,14 +23,31 @@ ALL = slice(None)
 """Index of all simulations that makes no copy."""
 
 
+@dataclass(frozen=True)
+class Steerable:
+    """What a user can set of a task's goal in the first simulation, and its current values.
+
+    Args:
+        direction: Current target direction in radians from the world's x axis; None if the task has none.
+        speed: Current target speed in m/s.
+        speeds: Lowest and highest target speed in m/s; None if the speed cannot be set.
+        place: Whether the task has a target that can be put somewhere.
+    """
+
+    direction: float | None = None
+    speed: float = 0.0
+    speeds: tuple[float, float] | None = None
+    place: bool = False
+
+
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
     A task defines :meth:`initial_state`, :meth:`observe` and :meth:`reward`, and where it needs them
-    :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal` and :meth:`normalised_return`. This
-    class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. All simulations step
-    together: under TorchRL's mask ``_step`` they do as well, and it masks their outputs. The state of a task beyond the
-    physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
+    :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal`, :meth:`normalised_return` and
+    :meth:`steer`. This class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. All
+    simulations step together: under TorchRL's mask ``_step`` they do as well, and it masks their outputs. The state of
+    a task beyond the physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
     :meth:`make_specs`.
 
     A simulation that diverges or gets a non-finite action ends only its own episode: it is ``terminated``, with reward
@@ -215,6 +233,26 @@ class CharacterEnv(EnvBase):
         return None
 
     @property
+    def steerable(self) -> Steerable:
+        """What viewers can set of the goal with :meth:`steer`: by default nothing."""
+        return Steerable()
+
+    def steer(
+        self,
+        *,
+        direction: float | None = None,
+        speed: float | None = None,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        """Set the goal of the first simulation as a user wants it, until the end of the next step.
+
+        Args:
+            direction: Target direction in radians from the world's x axis, or None for the task's.
+            speed: Target speed in m/s, or None for the task's.
+            place: Place of the target on the ground, x and y in metres, or None for the task's.
+        """
+
+    @property
     def physics_seconds(self) -> float:
         """Wall-clock seconds spent inside MuJoCo so far."""
         return self.simulation.physics_seconds
@@ -356,7 +394,8 @@ class CharacterEnv(EnvBase):
         for name, place in self._tracked.items():
             self.episode[name].copy_(place)
         self.update_goal()
-        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | self._each("truncated").unsqueeze(-1)
+        cut = self.one_each("truncated", self.truncated()).unsqueeze(-1)
+        truncated = (self.episode["elapsed_steps"] >= self.max_episode_steps) | cut
         return self._emit(ALL, reward.unsqueeze(-1).to(self._dtype), terminated.unsqueeze(-1), truncated)
 
     def _reset(
@@ -431,11 +470,14 @@ class CharacterEnv(EnvBase):
 
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward of the step (float64) and whether it ended the episode, ``(N,)`` each."""
-        return self._each("reward"), self._each("terminated")
+        return self.one_each("reward", self.reward()), self.one_each("terminated", self.terminated())
 
-    def _each(self, method: str) -> Tensor:
-        """What a method of the task returns, one number or flag for each simulation, ``(N,)``."""
-        value: Tensor = getattr(self, method)()
+    def one_each(self, method: str, value: Tensor) -> Tensor:
+        """Return the value of a task's method, after checking that it has one number or flag for each simulation.
+
+        Raises:
+            ValueError: If its shape is not ``(N,)``.
+        """
         if value.shape != (self.num_envs,):
             raise ValueError(
                 f"{type(self).__name__}.{method}() has shape {tuple(value.shape)}: return {(self.num_envs,)}, one for "

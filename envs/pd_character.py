@@ -126,6 +126,11 @@ class PDCharacterEnv(CharacterEnv):
         self._scale = torch.from_numpy(model.actuator_ctrlrange @ [-0.5, 0.5]).to(self.device)
         self._rest = torch.from_numpy(model.qpos0).to(self.device)
         self._centre = torch.from_numpy(rest_controls(model)).to(self.device)
+        self._mocap_rest: dict[str, Tensor] = {}  # of objects that are put, in the scene's rest pose
+        if model.nmocap:
+            data = mujoco.MjData(model)
+            rest = {"mocap_pos": data.mocap_pos, "mocap_quat": data.mocap_quat}
+            self._mocap_rest = {name: torch.from_numpy(value.copy()).to(self.device) for name, value in rest.items()}
         shapes = falling_geoms(model, self.character.feet, len(self._bodies))
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
@@ -214,14 +219,13 @@ class PDCharacterEnv(CharacterEnv):
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step: a fall earns nothing, and ends the episode unless told otherwise."""
         fallen = self.fallen()
-        reward, terminated = (
-            self._each("reward").masked_fill(fallen, 0.0),
-            self._each("terminated") | (fallen & self.terminate_on_fall),
-        )
+        reward, terminated = super()._outcome(diverged)
+        reward = reward.masked_fill(fallen, 0.0)
+        terminated = terminated | (fallen & self.terminate_on_fall)
         if self.curriculum.reward_weights is None:
             return reward, terminated
         self.episode[TASK_REWARD].copy_(reward)[diverged] = 0.0
-        return self._each("training_reward").masked_fill(fallen, 0.0), terminated
+        return self.one_each("training_reward", self.training_reward()).masked_fill(fallen, 0.0), terminated
 
     def _observed_of(self, ids: Tensor | slice) -> dict[str, Tensor]:
         observed = self.observe(ids)
@@ -253,6 +257,7 @@ class PDCharacterEnv(CharacterEnv):
         """
         qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
         start = self.initial_states.fill({"qpos": self._rest.repeat(num, 1), "qvel": qvel}, self.generator)
+        start |= {name: rest.repeat(num, 1, 1) for name, rest in self._mocap_rest.items()}
         if self.curriculum.random_first_length and num == self.num_envs:
             start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
         return start

@@ -1,32 +1,18 @@
 """The dribble task: move a ball to a target with the feet."""
 
 import math
-from collections.abc import Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 from torch import Tensor
 
-from torchrl_mcp.envs.tasks.rewards import transport_reward
-from torchrl_mcp.envs.tasks.transport import (
-    ANY_DIRECTION,
-    SUCCESS_DISTANCE,
-    SUCCESS_REACH,
-    goal_of,
-    horizontal_extent,
-    mocap_positions,
-    near,
-    placement,
-    places,
-)
-from torchrl_mcp.envs.tasks.transport_env import Transport
+from torchrl_mcp.envs.tasks.objects import horizontal_extent
+from torchrl_mcp.envs.tasks.places import near
+from torchrl_mcp.envs.tasks.rewards import SUCCESS_DISTANCE, SUCCESS_REACH
+from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.envs.tasks.waypoints import dribble_waypoint, place_seen
-
-OBJECTS = {"target": 3, "ball": 13}
-"""The objects in the order of the scene: target and ball. How many numbers the goal has of each: position (3),
-orientation (4), linear (3) and angular velocity (3)."""
 
 # Radius, mass, friction and damping of the ball are from the same authors' public code.
 RADIUS = 0.2
@@ -44,11 +30,6 @@ CONTACT_DAMPING = 25.0
 
 FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 0.55 to 0.71 of the speed.
 """
-
-
-dribble_reward = partial(transport_reward, weights=(0.1, 0.1, 0.3, 0.5), proximity_scale=0.5)
-"""The reward with the weights of its four terms: the character's speed towards the ball and its distance from the ball,
-and the speed of the ball towards the target and its distance from the target."""
 
 
 class Dribble(Transport):
@@ -72,13 +53,7 @@ class Dribble(Transport):
         num_envs: Number N of simulations.
         object_distances: Range (lo, hi) of the ball's distance from the character, in metres. Paper: 0 to 10; here from
             0.5, as in the same authors' public code, or from the first distance without contact if that is larger.
-        object_directions: Range (lo, hi) of the direction of the ball, in radians from the character's heading.
-        target_distances: Range (lo, hi) of the target's distance from the ball, in metres.
-        target_directions: Range (lo, hi) of the direction from the ball to the target, in radians from the direction of
-            the ball: 0 is straight beyond the ball.
-        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
-            3000 are 100 s, as in the same authors' public code.
-        **kwargs: Passed on to :class:`~torchrl_mcp.envs.tasks.transport_env.Transport`.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.tasks.transport.Transport`, where the arguments are described.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -93,72 +68,39 @@ class Dribble(Transport):
         torch.Size([2, 3, 16])
     """
 
-    objects = OBJECTS
-    reward_of = staticmethod(dribble_reward)
-    success_distance, success_reach = SUCCESS_DISTANCE, SUCCESS_REACH
+    objects: ClassVar[Mapping[str, int]] = {"target": 3, "ball": 13}
+    weights = (0.1, 0.1, 0.3, 0.5)
+    proximity_scale = 0.5
+    success_distance = SUCCESS_DISTANCE
+    success_reach = SUCCESS_REACH
 
     def __init__(
-        self,
-        character: str,
-        num_envs: int,
-        *,
-        object_distances: Sequence[float] = (0.5, 10.0),
-        object_directions: Sequence[float] = ANY_DIRECTION,
-        target_distances: Sequence[float] = (0.0, 10.0),
-        target_directions: Sequence[float] = ANY_DIRECTION,
-        max_episode_steps: int = 3000,
-        **kwargs: Any,
+        self, character: str, num_envs: int, *, object_distances: Sequence[float] = (0.5, 10.0), **kwargs: Any
     ) -> None:
-        super().__init__(
-            character,
-            num_envs,
-            furnish=add_pitch,
-            max_episode_steps=max_episode_steps,
-            **kwargs,
-        )
-        self.ranges = placement(
-            self.curriculum.mixture,
-            object_distances=object_distances,
-            object_directions=object_directions,
-            target_distances=target_distances,
-            target_directions=target_directions,
-        )
-        extent = horizontal_extent(
-            self.simulation.model, len(self._bodies), self.initial_states.poses(), 0.0, 2 * RADIUS
-        )
+        super().__init__(character, num_envs, furnish=add_pitch, object_distances=object_distances, **kwargs)
+        poses = self.initial_states.poses()
+        extent = horizontal_extent(self.simulation.model, len(self._bodies), poses, 0.0, 2 * RADIUS)
         self.ranges.keep_clear("object_distances", extent + RADIUS)
         self.ranges.to(self.device)
-        # Live views, made once.
-        self._marks = mocap_positions(self.simulation.model).to(self.device)
-        self._object, self._target = self.pose("ball")[0], self.pose("target")[0]
-        self.track(object=self._object)
+        self.begin_with("ball", "target")
         self.make_specs()
-
-    def initial_state(self, num: int) -> dict[str, Tensor]:
-        """Ball and target at drawn places around the character."""
-        start = super().initial_state(num)
-        ball, target = places(start["qpos"][:, :2], self.ranges.draw(num, self.generator))
-        start["qpos"][:, -7:-5], marks = ball, self._marks.repeat(num, 1, 1)
-        marks[:, 0, :2] = target
-        return {**start, "mocap_pos": marks}
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and where it sees target and ball."""
         state, objects = self.see(ids)
-        goal = goal_of(objects, self.objects, self.goal_positions, *self._waypoints(ids))
-        return {"observation": state, "goal": goal, "success": self.success()[ids].unsqueeze(-1)}
+        return {"observation": state, "goal": self.goal(objects, ids), "success": self.success()[ids].unsqueeze(-1)}
 
-    def _waypoints(self, ids: Tensor | slice) -> list[Tensor]:
-        """The places to go to next, if the goal has them."""
-        if not self.waypoint:
-            return []
-        com, _, ball, _, target = self._motion()
-        rest = ball + self.simulation.state["qvel"][:, -6:-4] / DAMPING  # the last step's is not known after a reset
-        return [place_seen(self, dribble_waypoint(com, ball, rest, target), ids)]
+    def waypoint_seen(self, ids: Tensor | slice) -> Tensor:
+        """See :func:`.dribble_waypoint`."""
+        com, _, ball, _, target = self.motion()
+        rest = ball + self.object.next_velocity[:, :2] / DAMPING  # the last step's is not known after a reset
+        return place_seen(self, dribble_waypoint(com, ball, rest, target), ids)
 
     def success(self) -> Tensor:
         """Whether the ball is at the target and the character near it, shape ``(N,)``, bool."""
-        return near(self._object, self._target, SUCCESS_DISTANCE) & near(self.com, self._object, SUCCESS_REACH)
+        return near(self.object.position, self.target.position, SUCCESS_DISTANCE) & near(
+            self.com, self.object.position, SUCCESS_REACH
+        )
 
 
 def add_pitch(spec: mujoco.MjSpec) -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import interval, not_negative, positive
+from torchrl_mcp.envs.base import Steerable
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
@@ -15,9 +16,9 @@ from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import unit_vector
+from torchrl_mcp.envs.tasks.places import LOGARITHMIC
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
-from torchrl_mcp.envs.tasks.transport import LOGARITHMIC
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
 
 
@@ -93,6 +94,7 @@ class Heading(PDCharacterEnv):
             **kwargs,
         )
         self.ranges = Ranges({"initial_directions": initial_directions}, self.curriculum.mixture).to(self.device)
+        self._steered = False
         self.make_specs()
 
     @property
@@ -122,11 +124,37 @@ class Heading(PDCharacterEnv):
 
     def update_goal(self) -> None:
         """Let the direction wander, and change some of the speeds."""
-        self.episode["direction"] += self._uniform(self.num_envs, -self.max_turn, self.max_turn)
+        turns = self._uniform(self.num_envs, -self.max_turn, self.max_turn)
+        turns[: self._steered] = 0.0
+        self.episode["direction"] += turns
         if self.changes_speed:
             speed, another = self.episode["speed"], self._uniform(self.num_envs, *self.speeds)
             changes = self._uniform(self.num_envs, 0.0, 1.0) < self.change_probability
+            changes[: self._steered] = False
             speed.copy_(torch.where(changes, another, speed))
+
+    @property
+    def steerable(self) -> Steerable:
+        """See :attr:`CharacterEnv.steerable`: the direction, and the speed if it has a range."""
+        return Steerable(
+            direction=float(self.episode["direction"][0]),
+            speed=float(self.episode["speed"][0]),
+            speeds=self.speeds if self.changes_speed else None,
+        )
+
+    def steer(
+        self,
+        *,
+        direction: float | None = None,
+        speed: float | None = None,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        """See :meth:`CharacterEnv.steer`: the user has direction and speed in hand, or neither."""
+        self._steered = direction is not None or speed is not None
+        if direction is not None:
+            self.episode["direction"][0] = direction
+        if speed is not None:
+            self.episode["speed"][0] = speed
 
     def reach(self) -> Reach | None:
         """See :meth:`CharacterEnv.reach`; None with a range of speeds, which are drawn as the episode goes on.

@@ -9,15 +9,17 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative, positive
+from torchrl_mcp.envs.base import Steerable
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.rotations import unit_vector
+from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, near, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
-from torchrl_mcp.envs.tasks.transport import ANY_DIRECTION, LOGARITHMIC, logarithmic, near, steps
-from torchrl_mcp.envs.tasks.waypoints import walkable, way
+from torchrl_mcp.envs.tasks.waypoints import place_ahead, walkable, way
 
 STANDING_SPEED = 0.1
 """Speed of the centre of mass in m/s below which a character stands."""
@@ -30,7 +32,7 @@ class Location(PDCharacterEnv):
     """A character goes to a place and stands there; now and then, it is sent to another.
 
     ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
-    distance, see :func:`~torchrl_mcp.envs.tasks.transport.logarithmic`. A place aside is seen as one to which the
+    distance, see :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. A place aside is seen as one to which the
     character can walk, see :func:`~torchrl_mcp.envs.tasks.waypoints.walkable`. With ``final_directions``, ``goal`` (4)
     ends with the unit vector of the direction to face at the place. The reward is
     :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the action could see.
@@ -103,6 +105,7 @@ class Location(PDCharacterEnv):
         shortest = self.ranges.lowest("target_intervals")
         not_negative(target_intervals=shortest)
         self.one_place = shortest >= max_episode_steps * self.control_timestep
+        self._steered = False
         self.make_specs()
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
@@ -147,6 +150,31 @@ class Location(PDCharacterEnv):
         for name, value in {**another, "reached": torch.zeros_like(over)}.items():
             old = self.episode[name]
             old.copy_(torch.where(over.view(-1, *[1] * (old.ndim - 1)), value, old))
+
+    @property
+    def steerable(self) -> Steerable:
+        """See :attr:`CharacterEnv.steerable`: the place; a direction and a speed put it ahead of the character."""
+        heading = float(self.heading(slice(1))[0])
+        return Steerable(direction=heading, speed=self.speed, speeds=(0.0, self.speed), place=True)
+
+    def steer(
+        self,
+        *,
+        direction: float | None = None,
+        speed: float | None = None,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        """See :meth:`CharacterEnv.steer`: in the user's hands, the place stays; let go, the task draws another."""
+        target = None if place is None else self.com.new_tensor(place)
+        if direction is not None and speed:
+            velocity = speed * unit_vector(self.com.new_tensor(direction))
+            target = place_ahead(self.com[0, :2], velocity)
+        if target is not None:
+            self.episode["target"][0] = target
+            self.episode["seconds_left"][0] = math.inf
+        elif self._steered:
+            self.episode["seconds_left"][0] = 0.0
+        self._steered = target is not None
 
     def reach(self) -> Reach | None:
         """See :meth:`CharacterEnv.reach`; None if an episode has several places, which are drawn as it goes on.

@@ -10,6 +10,12 @@ from torch import Tensor
 ARRIVAL_DISTANCE = 0.3
 """Distance in metres from a place at which a character has arrived, and should stand."""
 
+SUCCESS_DISTANCE = 0.5
+"""Distance in metres between ball and target for success, as in the same authors' public code."""
+
+SUCCESS_REACH = 2.0
+"""Largest distance in metres between character and ball for success."""
+
 
 def heading_reward(velocity: Tensor, direction: Tensor, speed: float) -> Tensor:
     r"""Reward of the heading task: walk in a target direction at a target speed.

@@ -1,132 +1,248 @@
-"""Functions that carrying and dribbling share: places of objects, the goal, and what a return can reach."""
+"""What carrying and dribbling share: a character brings an object to a target."""
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
-import mujoco
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import positive
+from torchrl_mcp.envs.base import Steerable
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
-from torchrl_mcp.envs.observations import SIZES
+from torchrl_mcp.envs.ideal import Reach, transport_reach
+from torchrl_mcp.envs.observations import SIZES, UNITS
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
-from torchrl_mcp.envs.rotations import unit_vector
+from torchrl_mcp.envs.tasks.objects import SceneObject
+from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges
-
-SUCCESS_DISTANCE = 0.5
-"""Distance in metres between object and target for success, as in the same authors' public code."""
-
-SUCCESS_REACH = 2.0
-"""Largest distance in metres between character and ball for success."""
-
-ANY_DIRECTION = (-math.pi, math.pi)
-"""All directions, in radians."""
+from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 
 POSITIONS = ("metres", "logarithmic")
 """Forms of the horizontal positions in a goal."""
-
-LINEAR_DISTANCE = 0.25
-"""Distance in metres below which logarithmic positions are nearly linear."""
-
-LOGARITHMIC = f"horizontal vector of length ln(1 + r / {LINEAR_DISTANCE} m), r the distance"
-"""Unit of a logarithmic place on the ground."""
 
 POSITION_UNIT = f"{LOGARITHMIC}; height in m"
 """Unit of a logarithmic position of an object."""
 
 
-def require_transport(*, speed: float, target_distance_power: float, goal_positions: str) -> None:
-    """Check the arguments of rewards and goals.
+class Transport(PDCharacterEnv):
+    """A character brings an object to a target: the reward of appendix D, its variants, and what a return can reach.
+
+    A subclass sets the class attributes below. Its constructor makes ``object`` and ``target`` with
+    :meth:`begin_with`, and ends with :meth:`make_specs`.
+
+    Args:
+        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        num_envs: Number N of simulations.
+        object_distances: Range (lo, hi) of the object's distance from the character, in metres. The paper's begins at
+            0; tasks raise lo until the object touches no character.
+        object_directions: Range (lo, hi) of the direction of the object, in radians from the character's heading.
+        target_distances: Range (lo, hi) of the target's distance from the object, in metres.
+        target_directions: Range (lo, hi) of the direction from the object to the target, in radians from the direction
+            of the object: 0 is straight beyond it.
+        speed: Target speed of character and object, in m/s. Paper: 1.
+        target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
+        success_reward: Set the reward to 1 while successful.
+        goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
+            :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. A table is 0.3 m wide, and in standardised metres this
+            is less than a tenth.
+        waypoint: End the goal with the place where the character should go next, see
+            :mod:`~torchrl_mcp.envs.tasks.waypoints`, as :class:`.Location` shows places.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
+            3000 are 100 s, as in the same authors' public code for a ball.
+        **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
     Raises:
-        ValueError: If one is out of range.
+        ValueError: If an argument is out of range.
     """
-    positive(speed=speed)
-    if target_distance_power not in (1, 2):
-        raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
-    if goal_positions not in POSITIONS:
-        raise ValueError(f"goal_positions={goal_positions!r} is unknown: pass {' or '.join(POSITIONS)}")
 
+    num_reward_terms = 4
 
-def placement(mixture: Sequence[Mapping[str, Any]], **ranges: Sequence[float]) -> Ranges:
-    """Return the ranges of distances and directions of object and target.
+    units: Mapping[str, str] = MappingProxyType({**UNITS, "waypoint": LOGARITHMIC})
 
-    Raises:
-        ValueError: If a range is invalid, or a distance below 0.
-    """
-    placed = Ranges(ranges, mixture)
-    placed.require_distances("object_distances", "target_distances")
-    return placed
+    objects: ClassVar[Mapping[str, int]]
+    """The objects in the order of the scene, and how many numbers the goal has of each."""
 
+    weights: ClassVar[tuple[float, float, float, float]]
+    """Weights of the four terms of :func:`~torchrl_mcp.envs.tasks.rewards.transport_reward`: the character's speed
+    towards the object and its distance from the object, the object's speed towards the target and its distance from the
+    target."""
 
-def places(root: Tensor, drawn: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    """Places of object and target around a character that faces along x.
+    proximity_scale: ClassVar[float]
+    """Scale of the distance between character and object in the reward, per square metre."""
 
-    Args:
-        root: Place of the character, ``(*B, 2)``, in metres.
-        drawn: Distances in metres and directions in radians of a :func:`placement`, each ``(*B)``: of the object from
-            the character, and of the target from the object, counted from the direction of the object.
+    success_distance: ClassVar[float]
+    """Distance in metres from the target at which an ideal player succeeds."""
 
-    Returns:
-        Both places, ``(*B, 2)``.
-    """
-    direction = drawn["object_directions"]
-    place = root + steps(drawn["object_distances"], direction)
-    return place, place + steps(drawn["target_distances"], direction + drawn["target_directions"])
+    success_reach: ClassVar[float] = math.inf
+    """Distance in metres from the object within which a player must be to succeed."""
 
+    object: SceneObject
+    target: SceneObject
 
-def steps(distances: Tensor, directions: Tensor) -> Tensor:
-    """Displacements ``(*B, 2)`` from lengths in metres and directions in radians."""
-    return unit_vector(directions) * distances.unsqueeze(-1)
+    def __init__(
+        self,
+        character: str,
+        num_envs: int,
+        *,
+        object_distances: Sequence[float] = (0.0, 10.0),
+        object_directions: Sequence[float] = ANY_DIRECTION,
+        target_distances: Sequence[float] = (0.0, 10.0),
+        target_directions: Sequence[float] = ANY_DIRECTION,
+        speed: float = 1.0,
+        target_distance_power: float = 2,
+        success_reward: bool = False,
+        goal_positions: str = "metres",
+        waypoint: bool = False,
+        max_episode_steps: int = 3000,
+        **kwargs: Any,
+    ) -> None:
+        positive(speed=speed)
+        if target_distance_power not in (1, 2):
+            raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
+        if goal_positions not in POSITIONS:
+            raise ValueError(f"goal_positions={goal_positions!r} is unknown: pass {' or '.join(POSITIONS)}")
+        self.speed = speed
+        self.target_distance_power = target_distance_power
+        self.success_reward = success_reward
+        self.goal_positions = goal_positions
+        self.waypoint = waypoint
+        self.goal_layout = goal_layout(self.objects, waypoint)
+        if goal_positions == "logarithmic":
+            self.units = {**self.units, **dict.fromkeys((f"{name}.position" for name in self.objects), POSITION_UNIT)}
+        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, **kwargs)
+        ranges = {
+            "object_distances": object_distances,
+            "object_directions": object_directions,
+            "target_distances": target_distances,
+            "target_directions": target_directions,
+        }
+        self.ranges = Ranges(ranges, self.curriculum.mixture)
+        self.ranges.require_distances("object_distances", "target_distances")
 
+    def begin_with(self, object: str, target: str) -> None:
+        """Look at the object and the target, bodies of the scene by name, and measure the object's velocity."""
+        self.object = SceneObject(self.simulation, object)
+        self.target = SceneObject(self.simulation, target)
+        self.track(object=self.object.position)
 
-def mocap_positions(model: mujoco.MjModel) -> Tensor:
-    """Positions of a model's mocap bodies, ``(M, 3)``."""
-    return torch.from_numpy(model.body_pos[model.body_mocapid >= 0])
+    def initial_state(self, num: int) -> dict[str, Tensor]:
+        """The character, with object and target at drawn places around it."""
+        start = super().initial_state(num)
+        drawn = self.ranges.draw(num, self.generator)
+        direction = drawn["object_directions"]
+        place = start["qpos"][:, :2] + steps(drawn["object_distances"], direction)
+        self.object.put(start, place)
+        self.target.put(start, place + steps(drawn["target_distances"], direction + drawn["target_directions"]))
+        return start
 
+    def goal(self, objects: Tensor, ids: Tensor | slice) -> Tensor:
+        """Goal of simulations, laid out as ``goal_layout`` says, ``(n, G)``.
 
-def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low: float, high: float) -> float:
-    """Horizontal extent of a character from its root.
+        Args:
+            objects: What the characters see of M objects, ``(n, M, 13)``, see :meth:`.PDCharacterEnv.see`.
+            ids: The simulations.
+        """
+        if self.goal_positions == "logarithmic":
+            objects = torch.cat([logarithmic(objects[..., :2]), objects[..., 2:]], -1)
+        parts = [objects[..., index, :size] for index, size in enumerate(self.objects.values())]
+        if self.waypoint:
+            parts.append(self.waypoint_seen(ids).to(objects.dtype))
+        return torch.cat(parts, -1)
 
-    Args:
-        model: The scene, whose first bodies are the character's.
-        num_bodies: Number of the character's bodies.
-        poses: Coordinates of the character, ``(P, nq)``.
-        low: Lowest height to include, in metres.
-        high: Highest height to include, in metres.
+    @abstractmethod
+    def waypoint_seen(self, ids: Tensor | slice) -> Tensor:
+        """The place to go to next, as simulations see it, ``(n, 2)``."""
 
-    Returns:
-        Largest radius in metres of the boxes around the character's shapes, over all poses.
-    """
-    data, radius = mujoco.MjData(model), 0.0
-    own = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0))
-    for pose in poses.cpu().numpy():
-        data.qpos[: len(pose)] = pose
-        mujoco.mj_kinematics(model, data)
-        half_sizes = np.einsum("gij,gj->gi", np.abs(data.geom_xmat[own].reshape(-1, 3, 3)), model.geom_aabb[own, 3:])
-        centres = data.geom_xpos[own] - data.xpos[1] * [1, 1, 0]
-        between = (centres[:, 2] - half_sizes[:, 2] < high) & (centres[:, 2] + half_sizes[:, 2] > low)
-        corners = (np.abs(centres) + half_sizes)[between, :2]
-        radius = max(radius, float(np.hypot(*corners.T).max(initial=0.0)))
-    return radius
+    @abstractmethod
+    def success(self) -> Tensor:
+        """Whether the object is where it should be, shape ``(N,)``, bool."""
 
+    def reward(self) -> Tensor:
+        """Reward of appendix D, or 1 while successful."""
+        reward = self.reward_of(*self.motion())
+        return reward.masked_fill(self.success(), 1.0) if self.success_reward else reward
 
-def goal_of(objects: Tensor, sizes: Mapping[str, int], positions: str, *others: Tensor) -> Tensor:
-    """Goal of a task with objects, laid out as :func:`goal_layout` says, ``(*B, G)``.
+    def reward_of(self, *motion: Tensor) -> Tensor:
+        """Reward of appendix D of a motion, as :meth:`motion` describes one, ``(N,)``."""
+        return transport_reward(
+            *motion,
+            weights=self.weights,
+            proximity_scale=self.proximity_scale,
+            speed=self.speed,
+            target_distance_power=self.target_distance_power,
+        )
 
-    Args:
-        objects: What the character sees of M objects, ``(*B, M, 13)``, see :meth:`.PDCharacterEnv.see`.
-        sizes: How many of these numbers the goal has of each object, by name.
-        positions: Form of the horizontal positions, one of :data:`POSITIONS`.
-        *others: What else the goal has, after the objects, ``(*B, F)``.
-    """
-    if positions == "logarithmic":
-        objects = torch.cat([logarithmic(objects[..., :2]), objects[..., 2:]], -1)
-    seen = [objects[..., index, :size] for index, size in enumerate(sizes.values())]
-    return torch.cat([*seen, *(other.to(objects.dtype) for other in others)], -1)
+    def training_reward(self) -> Tensor:
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
+        weights = self.curriculum.reward_weights
+        assert weights is not None
+        reward = transport_reward(
+            *self.motion(),
+            weights=weights,
+            proximity_scale=self.proximity_scale,
+            speed=self.speed,
+            target_distance_power=self.curriculum.target_distance_power,
+        )
+        discount = self.curriculum.discount
+        return training_reward(reward, self.success(), weights=weights, speed=self.speed, discount=discount)
+
+    def terminated(self) -> Tensor:
+        """A success, if it ends the episode."""
+        return self.success() if self.curriculum.ends_at_success else super().terminated()
+
+    def motion(self) -> tuple[Tensor, ...]:
+        """Horizontal centre of mass, its velocity, object, its velocity, and target, each ``(N, 2)``."""
+        parts = (
+            self.com,
+            self.velocity("com"),
+            self.object.position,
+            self.velocity("object"),
+            self.target.position,
+        )
+        return tuple(part[:, :2] for part in parts)
+
+    def reach(self) -> Reach:
+        """Returns of standing still, and of an ideal player that takes the object straight to its target."""
+        com, _, place, _, target = self.motion()
+        return transport_reach(
+            self.reward_of,
+            *(position.clone() for position in (com, place, target)),
+            speed=self.speed,
+            timestep=self.control_timestep,
+            num_steps=self.max_episode_steps,
+            success_distance=self.success_distance if self.success_reward else 0.0,
+            success_reach=self.success_reach,
+        )
+
+    @property
+    def steerable(self) -> Steerable:
+        """See :attr:`CharacterEnv.steerable`: the place of the target."""
+        return Steerable(place=True)
+
+    def steer(
+        self,
+        *,
+        direction: float | None = None,
+        speed: float | None = None,
+        place: tuple[float, float] | None = None,
+    ) -> None:
+        """See :meth:`CharacterEnv.steer`."""
+        if place is not None:
+            self.target.next_position[0, :2] = self.target.position.new_tensor(place)
+
+    def goal_mirror(self) -> Mirror:
+        """See :meth:`PDCharacterEnv.goal_mirror`."""
+        signs = [sign for size in self.objects.values() for sign in BODY_SIGNS[:size]]
+        return mirror_signs([*signs, *VECTOR_SIGNS] if self.waypoint else signs)
+
+    def arrows(self, index: int) -> list[Arrow]:
+        """Arrows from above the character to the object, and from above the object to the target."""
+        com, place, target = (part[index] for part in (self.com, self.object.position, self.target.position))
+        return [pointer(com, place), pointer(place, target)]
 
 
 def goal_layout(sizes: Mapping[str, int], waypoint: bool) -> dict[str, slice]:
@@ -141,39 +257,10 @@ def goal_layout(sizes: Mapping[str, int], waypoint: bool) -> dict[str, slice]:
     return {**layout, "waypoint": slice(start, start + len(VECTOR_SIGNS))} if waypoint else layout
 
 
-def goal_mirror(sizes: Mapping[str, int], waypoint: bool) -> Mirror:
-    """Return the reflection of a goal that exchanges left and right."""
-    signs = [sign for size in sizes.values() for sign in BODY_SIGNS[:size]]
-    return mirror_signs([*signs, *VECTOR_SIGNS] if waypoint else signs)
-
-
-def logarithmic(positions: Tensor) -> Tensor:
-    r"""Return positions of the same direction whose distance is logarithmic, ``(*B, 2)``.
-
-    .. math:: x \mapsto \frac{x}{|x|} \ln\left(1 + \frac{|x|}{d}\right), \quad d = 0.25 \text{ m}
-
-    Directions are as easy to tell near an object as far from it.
-
-    Args:
-        positions: Positions x in metres, shape ``(*B, 2)``.
-    """
-    distances = torch.linalg.vector_norm(positions, dim=-1, keepdim=True)
-    return torch.nn.functional.normalize(positions, dim=-1) * torch.log1p(distances / LINEAR_DISTANCE)
-
-
-def near(place: Tensor, target: Tensor, distance: float) -> Tensor:
-    """Whether positions ``(*B, D)`` are horizontally less than ``distance`` metres apart, ``(*B)``, bool."""
-    return torch.linalg.vector_norm((place - target)[..., :2], dim=-1) < distance
-
-
-def pointers(com: Tensor, place: Tensor, target: Tensor) -> list[Arrow]:
-    """Arrows from above a character to an object, and from above the object to its target, ``(3,)`` each in metres."""
-    return [_pointer(com, place), _pointer(place, target)]
-
-
-def _pointer(tail: Tensor, tip: Tensor) -> Arrow:
-    """A horizontal arrow above ``tail``, towards ``tip`` and at most 1 m long."""
-    tail, tip = tail.double().cpu(), tip.double().cpu()
+def pointer(tail: Tensor, tip: Tensor) -> Arrow:
+    """Return a horizontal arrow above ``tail``, towards ``tip``, positions ``(3,)`` in metres, and at most 1 m long."""
+    tail = tail.double().cpu()
+    tip = tip.double().cpu()
     way = (tip - tail) * torch.tensor([1.0, 1.0, 0.0])
     start = tail + torch.tensor([0.0, 0.0, 0.8])
     return start.numpy(), (start + way / way.norm().clamp_min(1.0)).numpy()

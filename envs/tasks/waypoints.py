@@ -8,8 +8,8 @@ from torch.nn.functional import normalize
 
 from torchrl_mcp.envs.base import ALL
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE
-from torchrl_mcp.envs.tasks.transport import SUCCESS_DISTANCE, SUCCESS_REACH, logarithmic, near, steps
+from torchrl_mcp.envs.tasks.places import logarithmic, near, steps
+from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, SUCCESS_DISTANCE, SUCCESS_REACH
 
 STRIDE = 1.0
 """Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""

@@ -5,15 +5,24 @@ import torch
 
 from torchrl_mcp.envs import Carry, Dribble, Heading
 from torchrl_mcp.envs.ideal import transport_reach
-from torchrl_mcp.envs.tasks.dribble import dribble_reward
+from torchrl_mcp.envs.tasks.rewards import transport_reward
 
-LAWS = {"speed": 1.0, "target_distance_power": 2}
+LAWS = {
+    "weights": Dribble.weights,
+    "proximity_scale": Dribble.proximity_scale,
+    "speed": 1.0,
+    "target_distance_power": 2,
+}
 
 
 def reach(com, position, target, num_steps, **laws):
     places = (torch.tensor([place], dtype=torch.float64) for place in (com, position, target))
     found = transport_reach(
-        lambda *state: dribble_reward(*state, **{**LAWS, **laws}), *places, speed=1.0, timestep=0.1, num_steps=num_steps
+        lambda *state: transport_reward(*state, **{**LAWS, **laws}),
+        *places,
+        speed=1.0,
+        timestep=0.1,
+        num_steps=num_steps,
     )
     return [value.item() for value in found]
 

@@ -7,9 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from torchrl_mcp.envs import Carry, Dribble, Heading, Location
-from torchrl_mcp.envs.rotations import unit_vector
-from torchrl_mcp.envs.tasks.waypoints import place_ahead
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
@@ -43,48 +40,34 @@ class Steering:
         self.direction: float | None = None
         self.speed: float | None = None
         self.place: tuple[float, float] | None = None
-        env = player.env
-        self._changes = (env.max_turn, env.change_probability) if isinstance(env, Heading) else (0.0, 0.0)
-        self._time_limit = env.max_episode_steps
+        self._time_limit = player.env.max_episode_steps
 
     @property
     def has_direction(self) -> bool:
         """Whether the task has a direction to turn."""
-        return isinstance(self.player.env, Heading | Location)
+        return self.player.env.steerable.direction is not None
 
     @property
     def has_speed(self) -> bool:
         """Whether the task has a speed to change."""
-        return self._speeds is not None
-
-    @property
-    def _speeds(self) -> tuple[float, float] | None:
-        """Range of the target speed in m/s, None without one."""
-        env = self.player.env
-        if isinstance(env, Location):
-            return 0.0, env.speed
-        return env.speeds if isinstance(env, Heading) and env.changes_speed else None
+        return self.player.env.steerable.speeds is not None
 
     @property
     def has_place(self) -> bool:
         """Whether the task has a target to place."""
-        return isinstance(self.player.env, Carry | Dribble | Location)
+        return self.player.env.steerable.place
 
     @property
     def target_direction(self) -> float:
-        """Current target direction, the user's, that of heading or else where the character faces, from -pi to pi."""
-        env = self.player.env
+        """Current target direction, the user's or the task's, from -pi to pi."""
         if self.direction is None:
-            return _wrapped(float(env.heading()[0] if isinstance(env, Location) else env.episode["direction"][0]))
+            return _wrapped(self.player.env.steerable.direction or 0.0)
         return self.direction
 
     @property
     def target_speed(self) -> float:
         """Current target speed, the user's or the task's, in m/s."""
-        env = self.player.env
-        if self.speed is None:
-            return env.speed if isinstance(env, Location) else float(env.episode["speed"][0])
-        return self.speed
+        return self.player.env.steerable.speed if self.speed is None else self.speed
 
     def aim(self, direction: float) -> None:
         """Set the target direction, in radians from the world's x axis."""
@@ -124,13 +107,11 @@ class Steering:
 
     def _lead(self, direction: float, speed: float) -> None:
         """Set direction and speed; the task changes neither at random any longer."""
-        env, speeds = self.player.env, self._speeds
+        speeds = self.player.env.steerable.speeds
         self.direction = _wrapped(direction)
         self.speed = min(max(speed, speeds[0]), speeds[1]) if speeds else None
-        if isinstance(env, Heading):
-            env.max_turn = env.change_probability = 0.0
-        elif isinstance(env, Location):
-            x, y = env.com[0, :2].tolist()
+        if self.has_place:
+            x, y = self.player.env.com[0, :2].tolist()
             self.place = x, y  # where it stands at a speed of 0
 
     def put(self, place: Sequence[float] | np.ndarray) -> None:
@@ -139,9 +120,9 @@ class Steering:
         A box that was put down is taken again.
         """
         if self.has_place:
-            if isinstance(self.player.env, Carry):
-                self.player.env.offer(0)
-            self.place, self.direction, self.speed = (float(place[0]), float(place[1])), None, None
+            self.place = float(place[0]), float(place[1])
+            self.direction = None
+            self.speed = None
 
     def pin(self, primitive: int, weight: float) -> None:
         """Hold the gate of a primitive, counted from 0, at a weight."""
@@ -180,39 +161,20 @@ class Steering:
 
     def let_go(self) -> None:
         """Return control of goal and gates to task and policy."""
-        if self.place is not None and isinstance(self.player.env, Location):
-            self.player.env.episode["seconds_left"][0] = 0.0  # the task draws another
         self.direction = self.speed = self.place = None
         self.player.pinned = {}
-        if self.player.env.max_episode_steps != self._time_limit:  # the episode goes on with its full length
-            self.player.env.max_episode_steps = self._time_limit
-            self.player.env.episode["elapsed_steps"][0] = 0
-        if isinstance(self.player.env, Heading):
-            self.player.env.max_turn, self.player.env.change_probability = self._changes
+        env = self.player.env
+        if env.max_episode_steps != self._time_limit:  # the episode goes on with its full length
+            env.max_episode_steps = self._time_limit
+            env.episode["elapsed_steps"][0] = 0
 
     def step(self) -> None:
         """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
-        held: dict[str, float | Sequence[float] | None] = {}
-        if isinstance(env, Heading):
-            held = {"direction": self.direction, "speed": self.speed}
-        elif self.place is not None and isinstance(env, Location):
-            held = {"target": self._ahead() if self.speed else self.place, "seconds_left": math.inf}
-        elif self.place is not None:
-            env.simulation.state["mocap_pos"][0, 0, :2] = torch.tensor(self.place)
-        for name, value in held.items():
-            if value is not None:
-                env.episode[name][0] = torch.as_tensor(value, dtype=torch.float64)
+        env.steer(direction=self.direction, speed=self.speed, place=self.place)
         if any(goal is not None for goal in (self.direction, self.speed, self.place)):
             env.max_episode_steps = sys.maxsize
         self.player.step()
-
-    def _ahead(self) -> tuple[float, float]:
-        """The place that leads the character in the target direction, x and y in metres."""
-        env = self.player.env
-        velocity = self.target_speed * unit_vector(torch.tensor(self.target_direction, dtype=torch.float64))
-        x, y = place_ahead(env.com[0, :2].cpu(), velocity).tolist()
-        return x, y
 
 
 def _wrapped(angle: float) -> float:

@@ -1,9 +1,13 @@
+from functools import partial
+
 import pytest
 import torch
 
-from torchrl_mcp.envs.tasks.carry import carry_reward
-from torchrl_mcp.envs.tasks.dribble import dribble_reward
-from torchrl_mcp.envs.tasks.rewards import holdout_reward
+from torchrl_mcp.envs import Carry, Dribble
+from torchrl_mcp.envs.tasks.rewards import holdout_reward, transport_reward
+
+carry_reward = partial(transport_reward, weights=Carry.weights, proximity_scale=Carry.proximity_scale)
+dribble_reward = partial(transport_reward, weights=Dribble.weights, proximity_scale=Dribble.proximity_scale)
 
 PAPER = {"forward_weight": 1.0, "healthy_weight": 1.0, "control_weight": 0.5, "contact_weight": 0.0005}
 

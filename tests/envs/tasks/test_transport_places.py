@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_mcp.envs import Carry, Dribble
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.tasks.transport import logarithmic
+from torchrl_mcp.envs.tasks.places import logarithmic
 
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 every_character = pytest.mark.parametrize("character", CHARACTERS)
