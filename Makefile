@@ -2,14 +2,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
-TREE := build/tree
 LATEST := build/latest
 # One torch thread per worker: two workers with a thread pool each would fight over two cores.
 # All tests of a file run in one worker, which makes the file's fixtures once.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-processors test-slow test-latest check docs linkcheck format bench tree clean
+.PHONY: help demo install test test-processors test-slow test-latest check docs linkcheck format bench clean
 
 help:
 	@echo "make demo       install, then run the demonstration"
@@ -57,18 +56,12 @@ test-latest:
 	$(LATEST)/bin/python -m pip freeze --exclude-editable
 	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 --dist loadfile -m "not slow"
 
-# mypy and doctest read folders, not import hooks, and so cannot see that envs/ is torchrl_mcp.envs.
-# They get a tree of links in which it is. Doctests leave out what imports an extra that need not be there.
-tree:
-	rm -rf $(TREE)
-	mkdir -p $(TREE)/torchrl_mcp
-	cd $(TREE)/torchrl_mcp && ln -s ../../../torchrl_mcp/* ../../../envs ../../../conf .
-
-check: $(STAMP) tree
+# Doctests leave out what imports an extra that need not be there.
+check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	cd $(TREE) && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p torchrl_mcp
-	cd $(TREE) && PYTHONPATH=. OMP_NUM_THREADS=1 ../../$(BIN)/pytest --doctest-modules --ignore-glob='*/physics/warp.py' torchrl_mcp
+	$(BIN)/mypy -p torchrl_mcp
+	$(PYTEST) --doctest-modules --ignore-glob='*/physics/warp.py' torchrl_mcp
 
 DOCS := .venv/.docs
 $(DOCS): $(STAMP)

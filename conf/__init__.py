@@ -3,7 +3,7 @@
 if __name__ != "torchrl_mcp.conf":
     raise ImportError(
         "import torchrl_mcp.conf, not conf: this folder is a part of the torchrl_mcp package "
-        "(install it with `pip install -e .` and use the full name)"
+        "(install it with `pip install -e .` and use the full name). A folder `conf` of your own needs an __init__.py"
     )
 
 from omegaconf import OmegaConf

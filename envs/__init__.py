@@ -3,7 +3,7 @@
 if __name__ != "torchrl_mcp.envs":
     raise ImportError(
         "import torchrl_mcp.envs, not envs: this folder is a part of the torchrl_mcp package "
-        "(install it with `pip install -e .` and use the full name)"
+        "(install it with `pip install -e .` and use the full name). A folder `envs` of your own needs an __init__.py"
     )
 
 # Before mujoco: with triton, which a CUDA build of torch brings and tensordict imports, the process would crash if

@@ -15,6 +15,18 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
 SOURCES = {"torchrl_mcp": "torchrl_mcp", "envs": "torchrl_mcp/envs", "conf": "torchrl_mcp/conf"}
+HOOK = """
+import importlib.util, sys
+from pathlib import Path
+
+class Hook:
+    def find_spec(name, path=None, target=None):
+        folder = Path("{clone}", name.removeprefix("torchrl_mcp."))
+        return importlib.util.spec_from_file_location(name, folder / "__init__.py") if folder.is_dir() else None
+
+sys.meta_path.append(Hook)
+"""
+"""What an editable install of earlier versions put into the environment."""
 
 
 def source_files():
@@ -37,20 +49,27 @@ def run_code(code, **kwargs):
     return run_python("-c", code, **kwargs)
 
 
+def clone(folder):
+    """Copy what a clone has of the packages, without what builds and runs left there."""
+    for name in SOURCES:
+        shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ["pyproject.toml", "LICENSE", "README.md"]:
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
+def build(folder, *options):
+    """Build in a folder as ``python -m build`` does; return the wheel."""
+    command = [sys.executable, "-m", "build", "--no-isolation", *options, "--outdir", folder / "dist", folder]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next((folder / "dist").glob("*.whl"))
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """The wheel that comes out of the source distribution, built from a copy: no stale ``build/`` leaks in."""
-    checkout, dist = tmp_path_factory.mktemp("checkout"), tmp_path_factory.mktemp("dist")
-    for folder in SOURCES:
-        shutil.copytree(ROOT / folder, checkout / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ["pyproject.toml", "LICENSE", "README.md"]:
-        if (ROOT / name).exists():
-            shutil.copy(ROOT / name, checkout)
-    build = subprocess.run(
-        [sys.executable, "-m", "build", "--no-isolation", "--outdir", dist, checkout], capture_output=True, text=True
-    )
-    assert build.returncode == 0, build.stdout + build.stderr
-    return next(dist.glob("*.whl"))
+    """The wheel that comes out of the source distribution."""
+    return build(clone(tmp_path_factory.mktemp("clone")))
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +102,76 @@ def test_wheel_holds_every_source_and_data_file(wheel):
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert packed == {str(target) for _, target in source_files()}
     assert "torchrl_mcp/py.typed" in packed
+
+
+def test_a_wheel_from_the_source_distribution_equals_one_from_the_clone(wheel, tmp_path):
+    with zipfile.ZipFile(wheel) as first, zipfile.ZipFile(build(clone(tmp_path), "--wheel")) as second:
+        assert sorted(first.namelist()) == sorted(second.namelist())
+        assert all(first.read(name) == second.read(name) for name in first.namelist())
+
+
+@pytest.fixture(scope="module")
+def clones(tmp_path_factory):
+    """Two clones, of which the first is installed editable, and the folder that this wrote into an environment.
+
+    They differ in a setting and in a version of the environments.
+    """
+    clones = [clone(tmp_path_factory.mktemp(name)) for name in ("a", "b")]
+    for folder in clones:
+        with (folder / "conf" / "preset" / "smoke.yaml").open("a") as file:
+            file.write(f"clone: {folder.name}\n")
+    site = tmp_path_factory.mktemp("site")
+    code = "import sys; from setuptools.build_meta import build_editable; build_editable(sys.argv[1])"
+    done = run_python("-c", code, site, cwd=clones[0])
+    assert done.returncode == 0, done.stderr
+    zipfile.ZipFile(next(site.glob("*.whl"))).extractall(site)
+    return *clones, site
+
+
+def test_an_editable_install_is_a_path_that_editors_and_type_checkers_read(clones):
+    installed, _, site = clones
+    assert [path.read_text().split() for path in site.glob("*.pth")] == [[str(installed)]]
+    assert not list(site.glob("*.py"))
+
+
+def test_a_clone_uses_its_own_folders_while_another_is_installed(clones):
+    _, other, site = clones
+    code = (
+        f"import runpy, site, sys; site.addsitedir({str(site)!r})\n"
+        "sys.argv = ['train', '--cfg', 'job', 'preset=smoke', 'task=heading', 'method=scratch']\n"
+        "runpy.run_module('torchrl_mcp.cli.train', run_name='__main__')\n"
+        "import torchrl_mcp.envs\n"
+        "print(*[m.__file__ for n, m in sys.modules.items() if n.startswith('torchrl_mcp')])"
+    )
+    done = run_code(code, cwd=other)
+    assert done.returncode == 0, done.stderr
+    *settings, files = done.stdout.splitlines()
+    assert f"clone: {other.name}" in settings
+    assert {Path(file).is_relative_to(other) for file in files.split()} == {True}
+    assert {"envs", "conf"} <= {Path(file).parent.name for file in files.split()}
+
+
+def test_a_clone_without_links_is_refused_instead_of_taking_the_folders_of_another(clones, tmp_path):
+    installed, other, _ = clones
+    shutil.copytree(other / "torchrl_mcp", tmp_path / "torchrl_mcp", symlinks=True)
+    for link in (tmp_path / "torchrl_mcp" / name for name in ("conf", "envs")):
+        link.unlink()
+        link.write_text(f"../{link.name}")  # as Git does where it may not write links
+    done = run_code(HOOK.format(clone=installed) + "import torchrl_mcp.envs, torchrl_mcp.conf", cwd=tmp_path)
+    assert done.returncode != 0
+    assert f"ImportError: {tmp_path / 'torchrl_mcp'}" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["envs", "conf"])
+def test_a_module_of_the_users_comes_before_a_folder_of_the_clone(name, tmp_path):
+    (tmp_path / f"{name}.py").write_text("MINE = True")
+    code = (
+        f"import sys; sys.path.remove(''); sys.path.append({str(ROOT)!r})\n"
+        "from torchrl_mcp.cli import parsing; parsing.find_own_modules()\n"
+        f"import {name}; print({name}.MINE)"
+    )
+    done = run_code(code, cwd=tmp_path)
+    assert done.stdout.split() == ["True"], done.stderr
 
 
 def test_installed_wheel_imports_outside_the_checkout(installed, tmp_path):

@@ -60,7 +60,7 @@ def test_a_task_that_waits_for_a_dead_worker_is_given_up_within_seconds_and_the_
     threading.Timer(0.5, workers[1].kill).start()
     began = time.monotonic()
     try:
-        with pytest.raises(ChildProcessError, match=r"worker 1 of 2 .* has ended by signal SIGKILL"):
+        with pytest.raises(ChildProcessError, match=r"worker 1 .* has ended by signal SIGKILL"):
             attend(for_ever, workers)
     finally:
         end(workers)
@@ -93,6 +93,34 @@ def test_a_start_whose_worker_dies_without_a_word_is_given_up_within_seconds():
     with pytest.raises(ChildProcessError, match="SIGKILL"), new_workers():
         begun(starting)
     assert time.monotonic() - began < 20
+
+
+def test_a_worker_that_died_before_anyone_looked_is_seen_although_another_still_starts():
+    def starting():
+        worker = start(time.sleep, 60.0)
+        worker.kill()
+        worker.join()
+        assert worker not in multiprocessing.active_children()  # and from here on forgotten
+        other = start(time.sleep, 60.0)
+        for_ever()
+        return worker, other
+
+    began = time.monotonic()
+    with pytest.raises(ChildProcessError, match=r"worker 0 .*SIGKILL"), new_workers():
+        begun(starting)
+    assert time.monotonic() - began < 20
+    assert not multiprocessing.active_children()
+
+
+def test_a_worker_that_closed_its_connection_is_named_by_how_it_ended():
+    def starting():
+        worker = start(time.sleep, 60.0)
+        worker.kill()
+        worker.join()
+        raise RuntimeError("the connection was closed") from EOFError()
+
+    with pytest.raises(ChildProcessError, match="SIGKILL"), new_workers():
+        begun(starting)
 
 
 @pytest.mark.parametrize(

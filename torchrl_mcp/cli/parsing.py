@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from functools import wraps
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped]
@@ -60,9 +61,15 @@ def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], 
 
 
 def find_own_modules() -> None:
-    """Append the working directory to Python's module path."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
+    """Add the working directory to Python's module path, after everything but a clone of this library.
+
+    A clone that is installed editable also offers the names ``envs`` and ``conf``.
+    """
+    if os.getcwd() in sys.path:
+        return
+    clone = str(Path(__file__).parents[2])
+    is_last = clone in sys.path and Path(clone, "pyproject.toml").is_file()
+    sys.path.insert(sys.path.index(clone) if is_last else len(sys.path), os.getcwd())
 
 
 def own_module(name: str) -> str:

@@ -1,7 +1,7 @@
 """Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.training import ray_agents
+from torchrl_mcp.training import ray_agents, ray_workers
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
@@ -205,9 +205,6 @@ class RemoteSource:
         seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
         self._starts += 1
         random = GlobalRNGState().state_dict()
-        self._watched = ExitStack()
-        if self._backend["backend"] == "ray":
-            self._watched.enter_context(ray_agents.watched())
         make_collector = partial(
             Collector,
             [partial(self._make_env, seed=int(seed)) for seed in seeds],
@@ -221,17 +218,10 @@ class RemoteSource:
             storing_device=batches.device,
             **self._backend,
         )
-        weights = SharedMemWeightSyncScheme()
-        if self._backend["backend"] == "process":
-            make_collector = partial(make_collector, weight_sync_schemes={"policy": weights})
         # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
-        try:
-            with threads_kept(), new_workers() as self._workers:
-                local = self._backend["backend"] == "process"
-                self._collector = begun(make_collector) if local else make_collector()  # Ray starts in the main thread
-        except BaseException:
-            weights.shutdown()  # at the interpreter's exit it would wait for ever for a thread that cannot start
-            raise
+        with ExitStack() as watched, threads_kept(), new_workers() as self._workers:
+            self._collector = self._begin(make_collector, watched)
+            self._watched = watched.pop_all()
         GlobalRNGState().load_state_dict(random)
         self._batches: Iterator[TensorDictBase] | None = None
 
@@ -271,10 +261,21 @@ class RemoteSource:
             raise ValueError("it was written with collector=local: resume with the same collector")
         self._starts = state["starts"]
 
+    def _begin(self, make_collector: Callable[..., Collector], watched: ExitStack) -> Collector:
+        """Return the collector, after its workers have started."""
+        if self._backend["backend"] == "process":
+            return _begin_processes(make_collector)
+        if self._backend["backend"] == "ray":  # starts in the main thread
+            watched.enter_context(ray_agents.watched())
+            with ray_workers.starting():
+                return make_collector(collector_class=ray_workers.RayWorker)
+        return make_collector()
+
     def _next(self) -> TensorDictBase:
-        self._collector.update_policy_weights_()
-        self._batches = self._batches or iter(self._collector)
-        return next(self._batches)
+        with ray_workers.working() if self._backend["backend"] == "ray" else nullcontext():
+            self._collector.update_policy_weights_()
+            self._batches = self._batches or iter(self._collector)
+            return next(self._batches)
 
 
 class _Autocast(TensorDictModuleBase):
@@ -289,6 +290,15 @@ class _Autocast(TensorDictModuleBase):
         """Act."""
         with torch.autocast(self.device_type, torch.bfloat16):
             return self.policy(tensordict)
+
+
+def _begin_processes(make_collector: Callable[..., Collector]) -> Collector:
+    weights = SharedMemWeightSyncScheme()
+    try:
+        return begun(partial(make_collector, weight_sync_schemes={"policy": weights}))
+    except BaseException:
+        weights.shutdown()  # at the interpreter's exit it would wait for ever for a thread that cannot start
+        raise
 
 
 def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **settings: int) -> Environments:

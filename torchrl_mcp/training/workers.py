@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from multiprocessing.process import BaseProcess
+from multiprocessing.process import BaseProcess, _dangling  # type: ignore[attr-defined]
 from typing import TypeVar
 
 Result = TypeVar("Result")
@@ -49,13 +49,13 @@ def begun(start: Callable[[], Result]) -> Result:
         OSError: Of a worker or of ``start``.
         ValueError: Likewise.
     """
-    others = set(multiprocessing.active_children())
+    others = _processes()
     outcome: Future[Result] = Future()
     thread = threading.Thread(target=_fulfil, args=(outcome, start), daemon=True)
     thread.start()
     workers: list[BaseProcess] = []
     while thread.is_alive():
-        thread.join(INTERVAL / 10)  # a worker that ended before it was seen would be waited for
+        thread.join(INTERVAL / 10)
         workers += [process for process in _started_beside(others) if process not in workers]
         try:
             _require_alive(workers)
@@ -64,18 +64,23 @@ def begun(start: Callable[[], Result]) -> Result:
             if not outcome.done():
                 raise
     error = outcome.exception()
-    if error is None or isinstance(error, (OSError, ValueError)):
+    if error is None or not isinstance(error, Exception) or isinstance(error, (OSError, ValueError)):
         return outcome.result()
-    if not isinstance(error, Exception):
-        raise error
-    lines = str(error).strip().splitlines() or [type(error).__name__]  # TorchRL passes on the worker's whole traceback
-    raise ChildProcessError(f"a worker failed while it started: {lines[-1]}") from error
+    if isinstance(error.__cause__, EOFError):  # a worker ended without a word
+        _require_alive(workers)
+    raise failure("a worker failed while it started", error) from error
+
+
+def failure(event: str, error: Exception) -> ChildProcessError:
+    """Return an error that commands explain, of one whose message may be a worker's whole traceback."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return ChildProcessError(f"{event}: {lines[-1].rstrip('.')}")
 
 
 @contextmanager
 def new_workers() -> Iterator[list[BaseProcess]]:
     """Yield a list, to which the processes that the block spawns are added; if the block fails, end them."""
-    others = set(multiprocessing.active_children())
+    others = _processes()
     workers: list[BaseProcess] = []
     method = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method("spawn", force=True)  # in its jobs, joblib sets a method of its own
@@ -133,9 +138,23 @@ def termination_as_interrupt() -> Iterator[None]:
         signal.signal(signal.SIGTERM, former)
 
 
+def _processes() -> set[BaseProcess]:
+    """Return the processes that this one has started, also ended ones that are still in use."""
+    # active_children() forgets a process that ended before anyone saw it.
+    return {process for process in set(_dangling) if _number(process)}
+
+
 def _started_beside(others: set[BaseProcess]) -> list[BaseProcess]:
-    """Return the child processes that are not among ``others``, in the order of their start."""
-    return sorted(set(multiprocessing.active_children()) - others, key=lambda process: process.pid or 0)
+    """Return the processes that this one has started and that are not among ``others``, in the order of their start."""
+    return sorted(_processes() - others, key=_number)
+
+
+def _number(process: BaseProcess) -> int:
+    """Return the number of a process, or 0 if it has not been started, or has been closed."""
+    try:
+        return process.pid or 0
+    except ValueError:
+        return 0
 
 
 def _follow_parent() -> None:
@@ -165,8 +184,8 @@ def _require_alive(workers: Sequence[BaseProcess]) -> None:
                 f"signal {signal.Signals(-code).name}" if code < 0 and sys.platform != "win32" else f"exit code {code}"
             )
             raise ChildProcessError(
-                f"worker {number} of {len(workers)} (process {process.pid}) has ended by {how}. It may have said why "
-                "above; SIGKILL often means that memory ran out: try fewer collector.num_workers or training.num_envs"
+                f"worker {number} (process {process.pid}) has ended by {how}. It may have said why above; SIGKILL "
+                "often means that memory ran out: try fewer collector.num_workers or training.num_envs"
             )
 
 
