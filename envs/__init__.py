@@ -13,6 +13,7 @@ import tensordict  # noqa: F401
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.curriculum import Curriculum
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.registration import register
 from torchrl_mcp.envs.tasks import Carry, Dribble, Heading, Holdout, Imitation, Location
 
 __all__ = [
@@ -26,3 +27,5 @@ __all__ = [
     "Location",
     "PDCharacterEnv",
 ]
+
+register()

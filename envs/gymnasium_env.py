@@ -34,7 +34,7 @@ class GymnasiumEnv(gymnasium.Env):
         ValueError: If ``render_mode`` is another.
 
     Example:
-        >>> import torchrl_mcp
+        >>> import torchrl_mcp.envs
         >>> env = gymnasium.make("torchrl_mcp/Heading-Biped-v0")
         >>> observation, info = env.reset(seed=0)
         >>> {name: value.shape for name, value in observation.items()}

@@ -35,7 +35,7 @@ ROOMS = (
     {"base"},
     {"pd_character"},
     {"tasks"},
-    {"gymnasium_env"},
+    {"registration", "gymnasium_env"},
 )
 """Folders and modules of ``torchrl_mcp.envs``, of which each may import those before it."""
 ROOM_RANKS = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
@@ -145,6 +145,22 @@ def test_the_library_imports_without_hydra_and_leaves_scipy_to_the_functions_tha
     run = subprocess.run([sys.executable, "-c", code, *library], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert int(run.stdout) == len(library) > 80
+
+
+def test_the_distributions_need_torch_alone_and_come_with_the_package():
+    code = (
+        "import sys, torchrl_mcp\n"
+        "assert 'torch' not in sys.modules\n"
+        "from torchrl_mcp import MultiplicativeGaussian\n"
+        "assert MultiplicativeGaussian is torchrl_mcp.distributions.MultiplicativeGaussian\n"
+        "assert not {'gymnasium', 'hydra', 'mujoco', 'tensordict', 'torchrl'} & set(sys.modules)\n"
+        "print(*dir(torchrl_mcp))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    names = run.stdout.split()
+    assert {"MultiplicativeGaussian", "distributions", "envs"} <= set(names)
+    assert not [name for name in names if name.startswith("_") and name != "__version__"]
 
 
 def imports_of_mujoco():

@@ -1,7 +1,4 @@
-"""Action distributions composed of K Gaussian primitives.
-
-They use torch alone; the package around them imports Gymnasium, to register its environments.
-"""
+"""Action distributions composed of K Gaussian primitives. Importing them imports torch alone."""
 
 from torchrl_mcp.distributions.additive import AdditiveGaussian
 from torchrl_mcp.distributions.multiplicative import MultiplicativeGaussian
