@@ -150,6 +150,19 @@ def test_a_stored_configuration_has_no_place_but_absolute_ones(begun):
     assert str(begun) not in text
 
 
+def test_a_resumed_run_takes_new_places_of_its_files_and_no_path_of_a_function_of_ones_own(tmp_path, command):
+    (tmp_path / "run").mkdir()
+    config = {"_target_": "own_module.motions", "path": "clips"}
+    library = {"_target_": places.FOLDER_LIBRARY, "path": "clips"}
+    text = yaml.safe_dump({"training": {"total_frames": 1}, "own": config, "motions": library})
+    (tmp_path / "run/config.yaml").write_text(text)
+    refused = command("train", "resume=run", "+own.path=other", "+motions.path=others", cwd=tmp_path)
+    assert refused.returncode
+    assert "leave out +own.path=other" in refused.stderr
+    assert "motions.path" in refused.stderr.partition(": leave out")[0]
+    assert (tmp_path / "run/config.yaml").read_text() == text
+
+
 @pytest.mark.parametrize("function", ["hydra.utils.get_class", "hydra.utils.get_method", "own_module.mixer"])
 def test_only_the_path_of_a_folder_of_motions_is_a_place(function):
     config = {"made": {"_target_": function, "path": "torch.nn.Linear"}, "pretrained": "builtin"}

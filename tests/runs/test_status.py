@@ -7,7 +7,8 @@ import pytest
 from rich.console import Console
 
 from torchrl_mcp.cli.status import main
-from torchrl_mcp.runs import lock
+from torchrl_mcp.runs import benchmark, experiment, lock
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
@@ -117,6 +118,31 @@ def test_the_command_shows_a_folder(runs, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", str(runs)])
     main()
     assert "1 running, 1 stopped, 1 done, 1 waiting" in capsys.readouterr().out
+
+
+def test_in_a_pipe_a_run_is_a_line_however_long_its_name(runs, capsys, monkeypatch):
+    name = "a-long-name" * 20
+    make_run(runs / name, frames=200)
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-status", str(runs)])
+    monkeypatch.setenv("COLUMNS", "80")
+    main()
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "long" in line]
+    assert line.split()[:3] == [name, "stopped", "200/1,000"]
+
+
+def test_a_run_of_a_benchmark_is_running_from_its_first_check_on(tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    seen = []
+
+    def check(cfg):
+        seen.append([(one.state, (one.folder / "train.log").exists()) for one in look(tmp_path, {run: 128})])
+        raise ValueError("a reason")
+
+    monkeypatch.setattr(experiment, "require_all", check)
+    with pytest.raises(ValueError, match="a reason"):
+        benchmark.run(compose_run("preset=smoke", "logger=none", f"run_dir={run}"))
+    assert seen == [[("running", True)]]
+    assert status(run, 128).state == "stopped"
 
 
 def test_a_folder_that_is_not_there_is_named(monkeypatch):

@@ -21,6 +21,7 @@ from mujoco.experimental.studio.web import web_server
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.viewer.guard import HERE, guarded, refusal
+from torchrl_mcp.viewer.panel import place
 from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.steering import Steering
 from torchrl_mcp.viewer.web import KEYS, BrowserEvent, BrowserInput, Pace, StudioApp, play_in_browser
@@ -84,12 +85,22 @@ def test_a_page_shows_the_character_while_it_plays(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))  # where Studio keeps its settings
     player = Brief()
     with shown(player) as address:
-        assert b"<canvas" in fetched(f"{address}/")
+        page = fetched(f"{address}/")
+        assert b"<canvas" in page
+        assert page.rstrip().endswith(b"</html>")  # in full, although it is longer than Studio's
+        assert page.index(b'name="viewport" content="width=device-width') < page.index(b"</head>")
         served = tmp_path / "served.mjb"
         while player.steps < 3:
             time.sleep(0.01)
         served.write_bytes(fetched(f"{address}/model"))
     assert mujoco.MjModel.from_binary_path(str(served)).nq == player.env.simulation.model.nq
+
+
+def test_on_a_phone_the_panel_is_at_the_lower_edge_and_elsewhere_below_the_menu():
+    corner, _, pivot = place(390, 844)
+    assert (corner.y, pivot.y) == (844 - 48, 1)
+    corner, _, pivot = place(1280, 844)
+    assert (corner.y, pivot.y) == (48, 0)
 
 
 def test_what_is_beside_the_simulation_is_drawn_where_it_is():

@@ -19,9 +19,11 @@ def main() -> None:
     from rich.console import Console
 
     from torchrl_mcp.runs.status import look, overview, table
+    from torchrl_mcp.runs.tables import as_text
 
     if not arguments.follow:
-        Console().print(table(look(arguments.folder), arguments.folder))
+        runs = table(look(arguments.folder), arguments.folder)
+        Console().print(runs) if sys.stdout.isatty() else print(as_text(runs))
         return
     try:
         with overview(arguments.folder):

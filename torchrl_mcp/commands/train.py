@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 
 from torchrl_mcp.commands import announce
 from torchrl_mcp.runs import places, quoting
-from torchrl_mcp.runs.trust import resuming
+from torchrl_mcp.runs.trust import read_config, resuming
 from torchrl_mcp.training.run_folder import CONFIG
 
 PROGRAM = "torchrl-mcp-train"
@@ -135,11 +135,12 @@ def _resume(cfg: DictConfig) -> Path:
     values: dict[str, Any] = {override.key_or_group: override.value() for override in overrides}
     del values["resume"]
     device, total_frames = values.pop("device", None), values.pop("training.total_frames", None)
-    moves = {name: str(value) for name, value in values.items() if name.split(".")[-1] in places.NAMES}
+    files = places.outside(read_config(folder / CONFIG)) if (folder / CONFIG).is_file() else {}
+    moves = {name: str(value) for name, value in values.items() if name in files}
     if ignored := [str(override.input_line) for override in overrides if override.key_or_group in {*values} - {*moves}]:
+        changeable = ["device", "training.total_frames", *files]
         raise ValueError(
-            "a resumed run keeps its settings, except for device, training.total_frames and the places of "
-            f"files: leave out {' '.join(ignored)}"
+            f"a resumed run keeps its settings, except for {', '.join(changeable)}: leave out {' '.join(ignored)}"
         )
     if records.is_complete(folder) and total_frames is None:
         print(f"{folder} is complete: nothing is left to do; training.total_frames=N makes it longer")

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
+from uuid import uuid4
 
 import torch
 from hydra.utils import instantiate
@@ -26,6 +27,7 @@ from torchrl_mcp.runs.requirements import require_arguments, require_entry, requ
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import begin_after
+from torchrl_mcp.training.run_folder import WANDB
 from torchrl_mcp.training.trainer import RunFolder, Trainer
 from torchrl_mcp.training.transfer import FrozenParts, require_frozen_input, require_parts, widen_goal
 from torchrl_mcp.training.update import Agent, Objective, PPOSettings
@@ -192,7 +194,7 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
     """Return the configured logger, if any, and the recorder of films, weights and learning curves, if one is."""
     # MLflow 3 writes to files, which need no server and stay in the run folder, only if this is set.
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
-    loggers = [instantiate(cfg.logger)] if cfg.logger else []
+    loggers = [instantiate(cfg.logger, **_identity(cfg.logger, folder))] if cfg.logger else []
     for logger in loggers:
         begin_after(logger, trainer.progress.frames)
     if cfg.get("record_interval") is None:
@@ -201,6 +203,16 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
     num_options = actor.num_options if isinstance(actor, OptionActor) else 0
     recorder = instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=num_options)
     return [*loggers, recorder]
+
+
+def _identity(logger: DictConfig, folder: Path) -> dict[str, Any]:
+    """Return the arguments of a logger by which a resumed run goes on with the same run at W&B."""
+    if logger.get("logger_type") != "wandb" or "id" in (logger.get("wandb_kwargs") or {}):
+        return {}
+    file = folder / WANDB
+    if not file.exists():
+        file.write_text(uuid4().hex[:8])
+    return {"wandb_kwargs": {"id": file.read_text()}}
 
 
 def _with_parts(task: DictConfig, arguments: Mapping[str, Any]) -> tuple[DictConfig, dict[str, Any]]:

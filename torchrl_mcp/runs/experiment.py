@@ -72,18 +72,23 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
     Raises:
         ValueError: As :func:`train` and :func:`resume`, or if the folder holds a run with other settings.
     """
-    plan = planned(cfg)
+    with lock.held(Path(cfg.run_dir), wait=wait):  # from the first on: torchrl-mcp-status sees that the run is alive
+        plan = planned(cfg)
+        require_all(plan.cfg)
+        with trusting(targets(plan.config)):
+            return _train_or_resume(plan, cfg.device)
+
+
+def _train_or_resume(plan: Plan, device: str) -> Path:
     folder = plan.folder
-    require_all(plan.cfg)
-    with lock.held(folder, wait=wait), trusting(targets(plan.config)):
-        if not (folder / CONFIG).exists():
-            return _train(plan)
-        if changed := records.changes(folder, plan.config):
-            raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
-        if is_complete(folder):
-            print(f"{folder} is complete: nothing is left to do", flush=True)
-        there = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
-        return _resume(folder, cfg.device, None, there)
+    if not (folder / CONFIG).exists():
+        return _train(plan)
+    if changed := records.changes(folder, plan.config):
+        raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
+    if is_complete(folder):
+        print(f"{folder} is complete: nothing is left to do", flush=True)
+    there = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
+    return _resume(folder, device, None, there)
 
 
 def _train(plan: Plan) -> Path:

@@ -19,11 +19,10 @@ HERE = "."
 """The run folder in its own configuration."""
 
 PRETRAINED = "pretrained"
-NAMES = (PRETRAINED, "path")
-"""Names of settings whose value is a file or folder outside the run folder."""
+"""Name of the settings whose value is a run folder or checkpoint."""
 
 FOLDER_LIBRARY = "torchrl_mcp.envs.motions.corpus.folder_library"
-"""The function whose argument ``path`` is a folder; ``path`` of others may be anything."""
+"""The function whose argument ``path`` is a folder. The ``path`` of others, also of own motions, may be anything."""
 
 BUILTIN = "builtin"
 """Value of ``pretrained``, or its beginning, for the networks that come with the library."""

@@ -3,6 +3,7 @@
 import difflib
 import inspect
 import pkgutil
+import sys
 from collections.abc import Collection, Mapping
 from importlib import import_module
 from importlib.util import find_spec
@@ -43,6 +44,7 @@ def require_all(cfg: DictConfig) -> None:
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
             "give its run folder as pretrained=<folder>"
             + (", or take the networks that come with the library: pretrained=builtin" if ours else "")
+            + "; benchmark=table2 runs both stages of several methods"
         )
 
 
@@ -67,7 +69,7 @@ def require_environment(cfg: DictConfig) -> None:
             f"task.{cfg.stage.name} of task={task} has no settings of its own: give task.pretrain.NAME=VALUE, which "
             "holds in both stages"
         )
-    environment, *_ = [pkgutil.resolve_name(name) for name in names]
+    environment, *_ = [_resolved(name) for name in names]
     able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
         known = " or ".join(able)
@@ -229,19 +231,48 @@ def import_own(module: str, origin: str) -> None:
         origin: What names it, the beginning of an error.
 
     Raises:
-        ValueError: If there is no such module, or it is no Python.
+        ValueError: If there is no such module, it is no Python, or Python finds another one of this name.
     """
+    top = module.partition(".")[0]
     try:
         import_module(module)
     except SyntaxError as error:
         raise ValueError(f"{origin} {module}, which is no Python: {error}") from error
     except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
+        if error.name != top:
+            _require_own(top, f"{origin} {module}")
             raise
         raise ValueError(
             f"{origin} {module}, which Python does not find: call from the folder of {module}.py, or add that to "
             "PYTHONPATH"
         ) from error
+    _require_own(top, f"{origin} {module}")
+
+
+def _resolved(name: str) -> Any:
+    """Return what a configuration names, which may be the user's.
+
+    Raises:
+        ValueError: If Python finds another module of the name of the user's.
+    """
+    try:
+        return pkgutil.resolve_name(name)
+    except (AttributeError, ImportError):
+        if (top := name.partition(".")[0]) in sys.modules:
+            _require_own(top, f"the configuration names {name}")
+        raise
+
+
+def _require_own(module: str, origin: str) -> None:
+    """Check that an imported module is the one in the working directory, if there is one, and none of Python's."""
+    own = next((file for file in (Path(f"{module}.py"), Path(module, "__init__.py")) if file.exists()), None)
+    imported = getattr(sys.modules[module], "__file__", None)
+    if own is None and module not in sys.stdlib_module_names:
+        return
+    if own is None or imported is None or not own.samefile(imported):
+        raise ValueError(
+            f"{origin}, but Python has another module {module}{f', {imported}' if imported else ''}: rename yours"
+        )
 
 
 def _exists(name: str) -> bool:

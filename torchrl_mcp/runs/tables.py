@@ -26,6 +26,11 @@ def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) 
         table.add_column(Text(name), justify="right" if numeric else "left", no_wrap=True)
     for row in rows:
         table.add_row(*(Text(_cell(value)) for value in row.values()))
+    return as_text(table)
+
+
+def as_text(table: Table) -> str:
+    """Return a table as text without folds and colours."""
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
     with console.capture() as capture:
         console.print(table)

@@ -14,8 +14,8 @@ from torchrl_mcp.training.run_folder import CSV_LOGGER, METRICS, flush, replacin
 def begin_after(logger: Logger, frames: int) -> None:
     """Make TensorBoard drop the values that a killed run logged after environment step ``frames``.
 
-    Other loggers need no change: the csv logger's files are rewound with ``metrics.csv``, and W&B and MLflow treat a
-    resumed run as a new one.
+    Other loggers need no change: the csv logger's files are rewound with ``metrics.csv``, W&B ignores steps that it has
+    already, and MLflow treats a resumed run as a new one.
     """
     if isinstance(logger, TensorboardLogger):
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog

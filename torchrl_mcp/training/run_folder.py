@@ -33,6 +33,9 @@ PROVENANCE = "origin.json"
 LOG = "train.log"
 """The output of a run of a benchmark."""
 
+WANDB = "wandb-id"
+"""The identifier of the run at W&B, by which a resumed run goes on there."""
+
 CHECKPOINTS = "checkpoints"
 """The folder of checkpoints."""
 

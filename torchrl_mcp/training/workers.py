@@ -2,10 +2,11 @@
 
 import multiprocessing
 import os
+import re
+import select
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -117,8 +118,11 @@ def end_with_parent_while_starting() -> None:
 
     The imports of a worker take seconds, and :func:`end_with_parent` is called after them. No effect on Windows.
     """
-    if "--multiprocessing-fork" in sys.orig_argv and sys.platform != "win32":
-        threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
+    if "--multiprocessing-fork" not in sys.orig_argv or sys.platform == "win32":
+        return
+    if pipe := re.search(r"pipe_handle=(\d+)", " ".join(sys.orig_argv)):
+        # The parent may have ended already, so that its number is of no use; the other end of the pipe is closed then.
+        threading.Thread(target=_follow, args=(os.dup(int(pipe[1])),), daemon=True).start()
 
 
 @contextmanager
@@ -164,9 +168,11 @@ def _follow_parent() -> None:
     os._exit(1)
 
 
-def _follow(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(INTERVAL)
+def _follow(pipe: int) -> None:
+    """End this process as soon as nobody can write to a pipe any longer."""
+    hang_up = select.poll()
+    hang_up.register(pipe, 0)
+    hang_up.poll()
     os._exit(1)
 
 

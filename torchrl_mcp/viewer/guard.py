@@ -30,6 +30,11 @@ MOST_VISITORS = 6
 CONTROL = ("/ui", "/drop")
 """Paths on which the server accepts input, and files to load."""
 
+FITTING = b"""<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>canvas { height: 100dvh }</style>
+"""
+"""What Studio's page lacks: without it a phone draws it 980 pixels wide, and its lower edge below its own bars."""
+
 VISITORS = (
     "Everybody who can reach the port sees the simulation, its model and the viewer's log with paths of files. "
     "Control and uploads stay with this machine"
@@ -83,6 +88,16 @@ def refusal(path: str, headers: Mapping[str, str], address: str) -> str | None:
     return None
 
 
+def fitted(response: Any) -> Any:
+    """Let a page fit the width and height of a screen; return other responses, and None, as they are."""
+    if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    response.body = response.body.replace(b"</head>", FITTING + b"</head>", 1)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return response
+
+
 def _serve(
     serve: Callable[..., Awaitable[Any]],
     handler: Callable[..., Awaitable[Any]],
@@ -94,7 +109,7 @@ def _serve(
 
     def admit(connection: Any, request: Any) -> Any:
         reason = refusal(request.path, request.headers, _sender(connection))
-        return connection.respond(403, f"{reason}\n") if reason else process_request(connection, request)
+        return connection.respond(403, f"{reason}\n") if reason else fitted(process_request(connection, request))
 
     async def attend(connection: Any) -> None:
         if _is_here(_sender(connection)):

@@ -16,6 +16,9 @@ Command = Callable[[Steering], None]
 WIDTH, HEIGHT = 160.0, 14.0
 """Size of a bar in pixels."""
 
+NARROW = 500
+"""Width of a display in pixels below which Studio's box at the top would cover most of the panel."""
+
 
 def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], None]) -> None:
     """Draw the panel for a frame.
@@ -25,7 +28,8 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
         weights: Weights of the primitives, or None without primitives.
         send: Called with the user's commands.
     """
-    imgui.SetNextWindowPos(imgui.Vec2(16, 48), int(imgui.Cond.FirstUseEver))
+    display = imgui.GetIO().DisplaySize
+    imgui.SetNextWindowPos(*place(display.x, display.y))
     imgui.Begin("steer", flags=int(imgui.WindowFlags.AlwaysAutoResize) | int(imgui.WindowFlags.NoNav))
     if steering.has_direction:
         imgui.SetNextItemWidth(WIDTH)
@@ -48,6 +52,18 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
     if not steering.has_speed:
         imgui.TextDisabled("up, down: one primitive alone")
     imgui.End()
+
+
+def place(width: float, height: float) -> tuple[imgui.Vec2, int, imgui.Vec2]:
+    """Return where the panel begins, when, and which of its corners that is: on a phone below Studio's box.
+
+    Args:
+        width: Width of the display in pixels.
+        height: Height of the display in pixels.
+    """
+    if width >= NARROW:
+        return imgui.Vec2(16, 48), int(imgui.Cond.FirstUseEver), imgui.Vec2(0, 0)
+    return imgui.Vec2(16, height - 48), int(imgui.Cond.Always), imgui.Vec2(0, 1)  # the first size is not the browser's
 
 
 def _draw_weights(steering: Steering, weights: Weights, send: Callable[[Command], None]) -> None:
