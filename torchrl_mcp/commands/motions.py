@@ -263,7 +263,7 @@ def _row(name: str, motion: Import, numbers: Summary) -> tuple[str, ...]:
         f"{numbers.speed:.2f}",
         f"{numbers.turn_rate:.2f}",
         "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
-        "-" if math.isnan(numbers.sole) else f"{100 * numbers.sole + 0.0:.1f} cm",
+        "-" if math.isnan(numbers.sole) else f"{round(100 * numbers.sole, 1) + 0.0:.1f} cm",
         f"{float(cut.max()):.1f} deg, {100 * float((cut > 1).double().mean()):.0f} %" if len(cut) else "-",
         f"{math.degrees(demand.limit):.1f} deg",
         f"{100 * demand.penetration:.1f} cm",

@@ -64,7 +64,7 @@ UNPICKLE = (
 
 CORRECTIONS = "correct the order of its rotations or the maps"
 
-FRAME_0 = f"take its first frame as the standing pose (--rest-frame 0), which mends this, or {CORRECTIONS}"
+FRAME_0 = f"take its first frame as the standing pose (--rest-frame 0), which stays within the limits, or {CORRECTIONS}"
 """Remedy if it has been tried and works."""
 
 REMEDIES = {

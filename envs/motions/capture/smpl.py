@@ -122,8 +122,8 @@ def _require_radians(archive: Archive, vectors: Tensor) -> None:
     if largest > 2 * math.pi:
         name = "poses" if "poses" in archive.names else "pose_body"
         raise archive.error(
-            f"{name} turns a joint by {largest:.4g} radians, more than a whole turn, and seems to be in degrees: convert "
-            "all rotations with numpy.radians"
+            f"{name} turns a joint by {largest:.4g} radians, more than a whole turn, and seems to be in degrees: "
+            "convert all rotations with numpy.radians"
         )
 
 
