@@ -1,4 +1,4 @@
-"""Points at which feet can touch the ground."""
+"""Points at which bodies can touch the ground."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.characters.contract import colliding_bodies
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.characters.kinematics import BodyStates, body_names
 from torchrl_mcp.envs.rotations import rotate
+
+LAYER = 0.03
+"""Height in metres above the lowest point of a body up to which other points may touch the ground, too."""
 
 
 class ContactPoints(NamedTuple):
@@ -24,6 +28,32 @@ class ContactPoints(NamedTuple):
     positions: Tensor
     velocities: Tensor
     offsets: Tensor
+
+
+class Support(NamedTuple):
+    """What may carry a character over time.
+
+    Attributes:
+        heights: Height of its lowest contact point, shape ``(T,)``, in metres.
+        speeds: Speed of the slowest contact point at most :data:`LAYER` above the lowest, shape ``(T,)``, in m/s.
+        bodies: Name of the body that has the lowest point, in each frame.
+    """
+
+    heights: Tensor
+    speeds: Tensor
+    bodies: list[str]
+
+
+def support(character: str, states: BodyStates) -> Support:
+    """Return the lowest contact point of all bodies that can collide, and the slowest near it, in T frames."""
+    names = sorted(colliding_bodies(character_model(character)))
+    points = [contact_points(character, name, states) for name in names]
+    owners = [index for index, found in enumerate(points) for _ in found.offsets]
+    heights = torch.cat([found.positions[..., 2] for found in points], dim=1)
+    speeds = torch.cat([found.velocities.norm(dim=-1) for found in points], dim=1)
+    height, lowest = heights.min(-1, keepdim=True)
+    slowest = speeds.where(heights <= height + LAYER, torch.inf).amin(-1)
+    return Support(height.squeeze(-1), slowest, [names[owners[index]] for index in lowest.squeeze(-1).tolist()])
 
 
 def contact_points(character: str, body: str, states: BodyStates) -> ContactPoints:

@@ -19,3 +19,17 @@ class MotionFormatError(ValueError):
     def __init__(self, path: str | Path, message: str, line: int | None = None) -> None:
         self.path, self.line = Path(path), line
         super().__init__(f"{path}: {message}" if line is None else f"{path}:{line}: {message}")
+
+
+class MisreadError(MotionFormatError):
+    """An error in a motion that can be read, but that no character can follow.
+
+    Args:
+        path: The file.
+        finding: What is impossible.
+        remedy: What to do about it.
+    """
+
+    def __init__(self, path: str | Path, finding: str, remedy: str) -> None:
+        self.finding = finding
+        super().__init__(path, f"{finding}: {remedy}")

@@ -1,5 +1,6 @@
 import json
 import math
+import pickle
 import re
 import subprocess
 import sys
@@ -115,14 +116,15 @@ def test_import_writes_clips_and_says_what_they_are_like(run, tmp_path):
     assert clips["walk"].fps == pytest.approx(20)
     assert torch.equal(clips["walk_mirrored"].qpos, clips["walk"].mirrored().qpos)
     lines = output.splitlines()
-    measured = ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "0.0", "deg,", "0", "%"]
+    measured = ["walk", "humanoid", "2.00", "20", "0.50", "0.00", "-", "-", "0.0", "deg,", "0", "%"]
     measured += ["0.0", "deg", "0.0", "cm", "0.0", "cm"]
     assert lines[1].split()[:-2] == measured
     assert lines[1].split()[-1] == "-"  # joints of the character itself have no rest pose
     assert lines[3].split()[4] == "0.30"
     assert [line.split()[0] for line in lines[2:5]] == ["walk_mirrored", "stroll", "stroll_mirrored"]
     assert lines[5].split() == ["total", "6.0"]
-    assert lines[6] == "written to clips"
+    assert lines[6].startswith("In walk, walk_mirrored, no part of the body rests")  # it glides without a step
+    assert lines[-1] == "written to clips"
 
 
 def test_a_mirror_image_replaces_no_other_clip(run, tmp_path):
@@ -142,7 +144,10 @@ def test_clips_and_recordings_can_be_inspected(run, tmp_path):
     assert status == 0
     assert output.splitlines()[1].split()[:5] == ["walk", "biped", "1.00", "30", "loop"]
     of_recording = run("inspect", "walk.txt", "--character", "biped")[1]
-    assert of_recording.replace("0.0 deg, 0 %", "-").split() == output.split()  # a clip tells of no cut
+    recorded, glides = (
+        [line for line in text.splitlines() if not line.startswith("In walk,")] for text in (of_recording, output)
+    )
+    assert "\n".join(recorded).replace("0.0 deg, 0 %", "-").split() == "\n".join(glides).split()  # a clip has no cut
     assert {path.name for path in tmp_path.iterdir()} == {"walk.txt", "walk.npz"}
 
 
@@ -231,6 +236,36 @@ def test_a_motion_whose_feet_slide_is_pointed_out(run, tmp_path):
         columns[16:20] = [math.cos(angle), 0.0, 0.0, math.sin(angle)]
     (tmp_path / "skate.txt").write_text(json.dumps(frames))
     assert run("inspect", "skate.txt")[1].splitlines()[-1].startswith("The feet slide in skate: unit, frame rate,")
+
+
+def test_a_body_that_hovers_along_is_pointed_out(run, tmp_path):
+    (tmp_path / "ghost.txt").write_text(motion(2.0, speed=1.0))
+    (tmp_path / "statue.txt").write_text(motion(2.0, speed=0.0))
+    lines = run("inspect", "ghost.txt", "statue.txt")[1].splitlines()
+    assert lines[-1].startswith("No part of the body rests on the ground in ghost: unit, frame rate,")
+
+
+def test_the_table_shows_how_high_standing_soles_are(run):
+    walk = stride("humanoid", 1.0, 0.0, strides=2)
+    walk.save("walk.npz")
+    qpos = walk.qpos.clone()
+    qpos[:, 2] += 0.04
+    MotionClip("humanoid", qpos, walk.fps).save("hovers.npz")
+    header, *rows = run("inspect", "walk.npz", "hovers.npz")[1].splitlines()
+    column = header.index("standing soles")
+    shown = [float(row[column:].split()[0]) for row in rows[:2]]
+    assert shown[1] - shown[0] == pytest.approx(4.0, abs=0.11)
+    assert abs(shown[0]) < 0.5
+
+
+def test_pickles_are_not_read_and_their_conversion_is_named(run, tmp_path):
+    (tmp_path / "dance.pkl").write_bytes(pickle.dumps({"smpl_poses": [], "smpl_trans": [], "smpl_scaling": [1.0]}))
+    status, output, errors = run("import", "dance.pkl", "--output", "clips")
+    assert (status, output) == (1, "")
+    for word in ("dance.pkl", "AISTDataset.load_motion", "numpy.savez", ".npz", "smpl_scaling"):
+        assert word in errors
+    assert "rename" not in errors
+    assert not (tmp_path / "clips").exists()
 
 
 def standing(turn):

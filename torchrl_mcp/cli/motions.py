@@ -88,7 +88,9 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--mirror", action="store_true", help="write mirror images as well")
     command.add_argument("--output", type=Path, default=Path(), help="folder (default here)")
     command.set_defaults(run="import_files")
-    command = commands.add_parser("inspect", parents=[source, target], help="duration, speed, turn rate, slide, limits")
+    command = commands.add_parser(
+        "inspect", parents=[source, target], help="duration, speed, turn rate, slide, soles, limits"
+    )
     command.add_argument("--strides", action="store_true", help="add length, cadence, width and more of human strides")
     command.set_defaults(run="inspect_files")
     command = commands.add_parser("render", parents=[source, target], help="contact sheet (.png) and film (.gif)")

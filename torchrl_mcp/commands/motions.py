@@ -42,6 +42,7 @@ COLUMNS = (
     "m/s",
     "|rad/s|",
     "slide m/s",
+    "standing soles",
     "cut to limits",
     "beyond limits",
     "below ground",
@@ -73,6 +74,12 @@ Failures = dict[Path, Exception]
 
 SLIDING = 0.2
 """Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
+
+GLIDING = 0.5
+"""The same for the slowest of the lowest points of the body."""
+
+CAUSES = "unit, frame rate, map or order of rotations"
+"""Settings that make feet slide if they are wrong."""
 
 
 def import_files(arguments: argparse.Namespace) -> None:
@@ -233,9 +240,15 @@ def _table(motions: Mapping[str, Import]) -> str:
             lines += f"\n{character} follows with {pairs}. If this is wrong, give a file of such lines (--bodies)."
     for name, motion in motions.items():
         if motion.assumed:
-            lines += f"\nAssumed for {name}: {motion.assumed}. If this is wrong, say which axis points up (--up)."
+            lines += f"\nAssumed for {name}: {motion.assumed}. If this is wrong, say which axis points up (--up) "
+            lines += "or which frame stands (--rest-frame)."
+    for note in dict.fromkeys(motion.ground for motion in motions.values() if motion.ground):
+        names = ", ".join(name for name, motion in motions.items() if motion.ground == note)
+        lines += f"\nIn {names}, {note}."
     if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
-        lines += f"\nThe feet slide in {', '.join(sliding)}: unit, frame rate, map or order of rotations may be wrong."
+        lines += f"\nThe feet slide in {', '.join(sliding)}: {CAUSES} may be wrong."
+    if gliding := [name for name, numbers in summaries.items() if numbers.gliding > GLIDING and name not in sliding]:
+        lines += f"\nNo part of the body rests on the ground in {', '.join(gliding)}: {CAUSES} may be wrong."
     return lines
 
 
@@ -250,6 +263,7 @@ def _row(name: str, motion: Import, numbers: Summary) -> tuple[str, ...]:
         f"{numbers.speed:.2f}",
         f"{numbers.turn_rate:.2f}",
         "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
+        "-" if math.isnan(numbers.sole) else f"{round(100 * numbers.sole, 1) + 0.0:.1f} cm",
         f"{float(cut.max()):.1f} deg, {100 * float((cut > 1).double().mean()):.0f} %" if len(cut) else "-",
         f"{math.degrees(demand.limit):.1f} deg",
         f"{100 * demand.penetration:.1f} cm",

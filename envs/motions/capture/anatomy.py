@@ -86,7 +86,7 @@ def find_joints(
         raise MotionFormatError(
             source.path,
             f"has no joint known as {', '.join(missing)}: say which it is with a map, such as "
-            f"{missing[0]}={_suggestion(missing[0], source.names)}; its joints are {', '.join(source.names)}",
+            f"{missing[0]}={_suggestion(missing[0], source)}; its joints are {', '.join(source.names)}",
         )
     trunk = source.ancestors(joints["root"])
     if wrong := [part for part in parts if part not in TRUNK and joints[part] in trunk]:
@@ -98,9 +98,14 @@ def find_joints(
     return {part: joints[part] for part in parts}
 
 
-def _suggestion(part: str, names: Sequence[str]) -> str:
+def _suggestion(part: str, source: SourceMotion) -> str:
     """Return a joint that may be the part, as an example for the user; JOINT if no name fits."""
-    heads = [name for name in names if part == "neck" and re.search("head|neck", name.lower())]
+    joints = [
+        name
+        for name, parent in zip(source.names, source.parents, strict=True)
+        if parent < 0 or name != f"{source.names[parent]}_end"
+    ]
+    heads = [name for name in joints if part == "neck" and re.search("head|neck", name.lower())]
     return heads[-1] if heads else "JOINT"
 
 
@@ -113,7 +118,8 @@ def _plain(names: Sequence[str]) -> list[str]:
 def _spellings(part: str) -> Iterator[str]:
     """Yield possible spellings of a part, the likeliest first."""
     if part == "neck":
-        yield from HEADS
+        for head in HEADS:
+            yield from (head, f"c{head}")  # VRM: J_Bip_C_Head
         return
     side, joint = part.split("_")
     for word in NAMES[joint]:

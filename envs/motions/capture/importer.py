@@ -31,7 +31,7 @@ from torchrl_mcp.envs.motions.capture.retarget import retarget
 from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
 from torchrl_mcp.envs.motions.capture.smpl import is_smpl, read_smpl
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.errors import MotionFormatError
+from torchrl_mcp.envs.motions.errors import MisreadError, MotionFormatError
 
 MISREAD = 30.0
 """Degrees beyond its limit that a joint reaches in most frames only if a recording is read wrongly."""
@@ -55,8 +55,20 @@ OPTIONS = {
 }
 """Options that apply to a kind, beside the frame rates."""
 
+UNPICKLE = (
+    "load it with the code of its data set (AIST++: AISTDataset.load_motion of aist_plusplus.loader; SMPL: pickle.load)"
+    " and write poses in radians, trans in metres and fps to an .npz with numpy.savez (AIST++: poses=smpl_poses, "
+    "trans=smpl_trans / smpl_scaling, fps=60)"
+)
+"""How to convert the pickles in which motions of SMPL's bodies are shared."""
+
+CORRECTIONS = "correct the order of its rotations or the maps"
+
+FRAME_0 = f"take its first frame as the standing pose (--rest-frame 0), which stays within the limits, or {CORRECTIONS}"
+"""Remedy if it has been tried and works."""
+
 REMEDIES = {
-    "skeleton": "correct the order of its rotations or the maps, or give another rest frame",
+    "skeleton": f"take a frame that stands as the standing pose (--rest-frame), or {CORRECTIONS}",
     "clip": "correct the map of bodies (--bodies), or take another motion",
     "deepmimic": "reorder its quaternions, or say that they are x, y, z, w (--quaternion xyzw); angles are in radians",
     "qpos": "correct the order of its joints (--joints) or of its quaternions (--quaternion); angles are in radians",
@@ -75,6 +87,7 @@ class Import(NamedTuple):
         assumed: What was assumed about the standing pose against that of the file; or nothing.
         bodies: Bodies of the character by part of the recorded person, if inverse kinematics fitted them.
         missed: Greatest angle in degrees by which a bone of them misses its direction in each frame, shape ``(T,)``.
+        ground: What was assumed about the ground other than that feet stand on it and it is flat; or nothing.
     """
 
     clip: MotionClip
@@ -83,6 +96,7 @@ class Import(NamedTuple):
     assumed: str = ""
     bodies: Mapping[str, str] = MappingProxyType({})
     missed: Tensor = torch.empty(0)
+    ground: str = ""
 
 
 def import_motion(path: str | Path, character: str, **options: Any) -> MotionClip:
@@ -165,7 +179,7 @@ def imported(
         case "skeleton":
             source = _skeleton(path, fps=fps, asf=asf, body_model=body_model)
             followers = {} if character in HUMANS else key_map(character, bodies)
-            return _retargeted(source, character, rate, kind, followers, **skeletal)
+            return _of_skeleton(source, character, rate, followers, **skeletal)
         case "clip":
             if fps is not None:
                 raise ValueError(f"fps does not apply to {path}, {KINDS[kind]}, which has its own: leave it out")
@@ -177,6 +191,22 @@ def imported(
             return found if character == human else _of_clip(path, found.clip, character, rate, kind, bodies)
     motion = read_qpos(path, character, fps=fps, quaternion=quaternion, joints=joints)
     return _assembled(path, character, motion, rate, kind)
+
+
+def _of_skeleton(
+    source: SourceMotion, character: str, rate: float | None, bodies: Mapping[str, str], **skeletal: Any
+) -> Import:
+    """Retarget the motion of a file; an error names frame 0 as the standing pose if that is the remedy."""
+    try:
+        return _retargeted(source, character, rate, "skeleton", bodies, **skeletal)
+    except MisreadError as error:
+        if skeletal["rest_frame"] is not None:
+            raise
+        try:
+            _retargeted(source, character, rate, "skeleton", bodies, **skeletal | {"rest_frame": 0})
+        except MotionFormatError:
+            raise error from None
+        raise MisreadError(source.path, error.finding, FRAME_0) from error
 
 
 def _retargeted(
@@ -233,10 +263,10 @@ def _of_clip(
 
 def _assembled(path: str | Path, character: str, motion: JointMotion, rate: float | None, kind: str) -> Import:
     """Make a clip of a motion, if limits leave most of it as it is."""
-    clip, cut = assembled(character, motion, rate=RATE if rate is None else rate)
+    clip, cut, ground = assembled(character, motion, rate=RATE if rate is None else rate)
     degrees = torch.rad2deg(cut)
     _require_within(path, degrees, kind)
-    return Import(clip, cut=degrees)
+    return Import(clip, cut=degrees, ground=ground)
 
 
 def _kind(path: str | Path) -> str:
@@ -251,7 +281,9 @@ def _kind(path: str | Path) -> str:
         case ".npz":
             archive = Archive(path)
             return "clip" if "character" in archive.names else "skeleton" if is_smpl(archive) else "qpos"
-    raise MotionFormatError(path, "ends in none of .bvh, .amc, .npz, .csv, .json and .txt: pass a motion, or rename it")
+        case ".pkl" | ".pickle":
+            raise MotionFormatError(path, f"is a pickle, whose reading can run any code: {UNPICKLE}")
+    raise MotionFormatError(path, "ends in none of .bvh, .amc, .npz, .csv, .json and .txt: convert it to one of them")
 
 
 def _require_applicable(path: str | Path, kind: str, options: Mapping[str, Any]) -> None:
@@ -278,8 +310,8 @@ def _require_within(path: str | Path, cut: Tensor, kind: str) -> None:
     """Check that the limits of the character's joints leave most frames roughly as they are."""
     misread = float((cut > MISREAD).double().mean())
     if misread > 0.5:
-        raise MotionFormatError(
-            path,
+        finding = (
             f"in {100 * misread:.0f} % of its frames the limits of the character would cut a joint by more than "
-            f"{MISREAD:g} degrees, and by up to {float(cut.max()):.0f}: {REMEDIES[kind]}",
+            f"{MISREAD:g} degrees, and by up to {float(cut.max()):.0f}"
         )
+        raise MisreadError(path, finding, REMEDIES[kind])

@@ -9,11 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
-from torchrl_mcp.envs.characters.kinematics import body_states
+from torchrl_mcp.envs.motions.capture.ground import grounded
 from torchrl_mcp.envs.motions.clip import MotionClip
-from torchrl_mcp.envs.motions.contacts import contact_points
 from torchrl_mcp.envs.rotations import about_z, from_rotation_vector, heading, inverse, multiply, to_rotation_vector
 
 HUMANS = ("humanoid", "biped")
@@ -61,10 +59,10 @@ class JointMotion(NamedTuple):
     loop: bool = False
 
 
-def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[MotionClip, Tensor]:
+def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[MotionClip, Tensor, str]:
     """Make a clip of a motion, and measure what the limits of the character's joints cut off.
 
-    The clip begins at x = y = 0, with the soles on the ground. Joints that the character lacks are left out; joints
+    The clip begins at x = y = 0, with standing feet on the ground. Joints that the character lacks are left out; joints
     that only the character has stay straight.
 
     Args:
@@ -73,7 +71,8 @@ def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[Moti
         rate: Frames per second of the clip; the nearest rate that divides its duration into whole frames is used.
 
     Returns:
-        The clip, and the greatest angle in radians by which a joint of each frame was cut, shape ``(T,)``.
+        The clip, the greatest angle in radians by which a joint of each frame was cut, shape ``(T,)``, and what was
+        assumed about the ground, see :func:`~torchrl_mcp.envs.motions.capture.ground.grounded`.
 
     Raises:
         ValueError: If fewer than two frames would remain at this rate.
@@ -83,8 +82,10 @@ def assembled(character: str, motion: JointMotion, *, rate: float) -> tuple[Moti
     steps = round(duration * rate)
     frames = np.interp(np.linspace(0, duration, steps + 1), motion.times.numpy(), np.arange(len(motion.times)))
     qpos, cut = states(character, motion)
-    by_frame = MotionClip(character, grounded(character, qpos), fps=1.0)
-    return MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, motion.loop), cut
+    qpos, ground = grounded(character, qpos, motion.times, loop=motion.loop)
+    by_frame = MotionClip(character, qpos, fps=1.0)
+    clip = MotionClip(character, by_frame.at(torch.from_numpy(frames)), steps / duration, motion.loop)
+    return clip, cut, ground
 
 
 def require_frames(duration: float, rate: float) -> None:
@@ -142,24 +143,6 @@ def states(character: str, motion: JointMotion) -> tuple[Tensor, Tensor]:
             excess = (values - qpos[:, place]).abs()
         cut = torch.maximum(cut, excess)
     return qpos, cut
-
-
-def grounded(character: str, qpos: Tensor) -> Tensor:
-    """Shift a motion to begin at x = y = 0, with feet below the ground in at most a fiftieth of the frames.
-
-    Args:
-        character: Name of the character.
-        qpos: States, shape ``(T, nq)``.
-    """
-    shift = torch.cat([qpos[0, :2], torch.quantile(lowest_soles(character, qpos), 0.02).unsqueeze(0)])
-    return torch.cat([qpos[:, :3] - shift, qpos[:, 3:]], dim=-1)
-
-
-def lowest_soles(character: str, qpos: Tensor) -> Tensor:
-    """Height of the lowest point of the feet, shape ``(T,)``, in metres."""
-    bodies = body_states(character, qpos, torch.zeros(len(qpos), character_model(character).nv, dtype=torch.float64))
-    points = [contact_points(character, foot, bodies).positions for foot in CHARACTERS[character].feet]
-    return torch.cat(points, dim=1)[..., 2].amin(-1)
 
 
 def speeds(path: Tensor, times: Tensor) -> Tensor:

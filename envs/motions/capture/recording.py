@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, LEG, bones, find_joints
 from torchrl_mcp.envs.motions.capture.joint_motion import LONGEST, TOP_SPEED, speeds
 from torchrl_mcp.envs.motions.capture.skeleton import SourceMotion
-from torchrl_mcp.envs.motions.capture.upright import upright
+from torchrl_mcp.envs.motions.capture.upright import stands_better, upright
 from torchrl_mcp.envs.rotations import inverse, multiply
 
 UNITS = (1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45)
@@ -25,6 +25,10 @@ SHORTEST_TRUNK = 0.1
 
 SHORTEST_BONE = 0.06
 """Length of a bone of a limb, in lengths of the legs, below which it determines no direction."""
+
+
+FRAME_0 = "frame 0 is the standing pose (--rest-frame 0), as the rest pose of the file does not stand"
+"""What is assumed of a file whose bones lie along an axis."""
 
 
 class Recording(NamedTuple):
@@ -82,8 +86,10 @@ def record(
     whole, source = source, source.without_first(skip)
     _require_end(source)
     pose = source.poses()
+    taken = rest_frame is None and stands_better(whole, joints, whole.rest)
+    rest_frame = 0 if taken else rest_frame
     rest = whole.rest if rest_frame is None else whole.pose(rest_frame)
-    rest, axes, assumed = upright(source, joints, rest, pose, up=up, rest_frame=rest_frame)
+    rest, axes, assumed = upright(source, joints, rest, pose, up=up, rest_frame=rest_frame, skip=skip)
     metres = _metres_per_unit(source, {part: pose.positions[:, joint] for part, joint in joints.items()}, scale)
     positions, standing = metres * pose.positions @ axes.mT, metres * rest.positions @ axes.mT
     turns = multiply(pose.rotations, inverse(rest.rotations).expand_as(pose.rotations))
@@ -93,7 +99,7 @@ def record(
         turns={part: turns[:, joint] for part, joint in joints.items()},
         standing={part: standing[joint] for part, joint in joints.items()},
         times=torch.arange(len(source.rotations), dtype=torch.float64) / source.fps,
-        assumed=assumed,
+        assumed="; ".join(filter(None, [FRAME_0 if taken else "", assumed])),
     )
     _require_bones(source, recording)
     _require_no_jump(source, recording)

@@ -1,5 +1,6 @@
 """Motions of SMPL's bodies (``.npz``): AMASS, SMPL, SMPL-H and SMPL-X."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -76,6 +77,7 @@ def read_smpl(path: str | Path, *, body_model: str | Path | None = None, fps: fl
     vectors, root = _vectors(archive), archive.numbers("trans", 3)
     if len(root) != len(vectors):
         raise archive.error(f"has {len(vectors)} poses and {len(root)} positions in trans: they should be equally many")
+    _require_radians(archive, vectors)
     rate = frame_rate(fps, archive.number(*RATES))
     if rate is None:
         raise archive.error(f"has no frame rate ({', '.join(RATES)}): give it (--fps)")
@@ -112,6 +114,17 @@ def _vectors(archive: Archive) -> Tensor:
         known = ", ".join(map(str, NUMBERS))
         raise archive.error(f"poses has shape {tuple(poses.shape)}, and should have (T, N), T >= 2, N one of {known}")
     return poses[:, : NUMBERS[0]]
+
+
+def _require_radians(archive: Archive, vectors: Tensor) -> None:
+    """Check that no joint turns by more than a whole turn; the root may, if its turns are counted."""
+    largest = float(vectors[:, 3:].unflatten(-1, (-1, 3)).norm(dim=-1).max())
+    if largest > 2 * math.pi:
+        name = "poses" if "poses" in archive.names else "pose_body"
+        raise archive.error(
+            f"{name} turns a joint by {largest:.4g} radians, more than a whole turn, and seems to be in degrees: "
+            "convert all rotations with numpy.radians"
+        )
 
 
 def _shaped(model: Archive, betas: Tensor, parents: Sequence[int]) -> Tensor:

@@ -20,6 +20,9 @@ VERTICALS = {
 ROUGHLY, CLOSELY = math.cos(math.radians(60)), math.cos(math.radians(10))
 """Cosines of the angles up to which legs and trunk point along an axis, and up to which they are meant to be on it."""
 
+UPRIGHT = math.radians(20)
+"""Angle to an axis up to which trunk and bones of the legs of a pose stand upright beyond doubt."""
+
 SHORTEST_TRUNK = 0.12
 """Length from hips to chest, in lengths of the legs, below which it determines no direction."""
 
@@ -49,6 +52,7 @@ def upright(
     *,
     up: str | None = None,
     rest_frame: int | None = None,
+    skip: int = 0,
 ) -> Standing:
     """Find the vertical of a motion, and turn its rest pose to stand along it.
 
@@ -63,6 +67,7 @@ def upright(
         frames: The poses of the motion.
         up: The vertical, one of :data:`VERTICALS`; None to find it.
         rest_frame: Number of the frame that the user declared to stand upright, or None.
+        skip: Number of the first of the frames, for an error.
 
     Raises:
         MotionFormatError: If the body does not stand in the rest pose, or along no axis in the motion.
@@ -70,9 +75,15 @@ def upright(
     """
     if up is not None and up not in VERTICALS:
         raise ValueError(f"up={up!r} is no axis: pass one of {', '.join(VERTICALS)}")
-    body = _body(source, _parts(joints, rest), "its rest pose" if rest_frame is None else f"frame {rest_frame}")
+    moving, body = _parts(joints, frames), _body(_parts(joints, rest))
+    if body is None:
+        named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"
+        raise source.error(
+            f"{named} does not stand with the legs straight and the arms down or to the sides: "
+            f"{_remedy(moving, skip)}say with a map which joints are which (--map)"
+        )
     nearest = _nearest(body)
-    start, chosen, moving = VERTICALS[nearest], up or nearest, _parts(joints, frames)
+    start, chosen = VERTICALS[nearest], up or nearest
     if rest_frame is None:
         chosen = up or _vertical(source, moving, source.up or nearest)
         if body @ start < CLOSELY and _closely(moving, VERTICALS[chosen]):
@@ -108,8 +119,14 @@ def _directions(parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     return normalize(legs, dim=-1), normalize(torch.where(short, legs, trunk), dim=-1)
 
 
-def _body(source: SourceMotion, rest: Mapping[str, Tensor], named: str) -> Tensor:
-    """Direction upwards of legs and trunk in a pose that stands, shape ``(3,)``."""
+def stands_better(source: SourceMotion, joints: Mapping[str, int], rest: Pose) -> bool:
+    """Whether frame 0 of a motion stands upright, and its rest pose does not stand."""
+    frame = _parts(joints, source.pose(0))
+    return _body(_parts(joints, rest)) is None and _body(frame) is not None and bool(_lean(frame) < UPRIGHT)
+
+
+def _body(rest: Mapping[str, Tensor]) -> Tensor | None:
+    """Direction upwards of legs and trunk in a pose, shape ``(3,)``; None if it does not stand."""
     legs, trunk = _directions(rest)
     axis = VERTICALS[_nearest(trunk)]
     along = axis if trunk @ axis > 0.9 else trunk
@@ -118,12 +135,26 @@ def _body(source: SourceMotion, rest: Mapping[str, Tensor], named: str) -> Tenso
         for limb in (LEG, ARM)
     )
     across = torch.linalg.cross(rest["left_hip"] - rest["right_hip"], along)
-    if max(lower) > -ROUGHLY or max(arms, default=0.0) > 0.9 or not across.any():
-        raise source.error(
-            f"{named} does not stand with the legs straight and the arms down or to the sides: take a frame that does "
-            "instead, such as the first with --rest-frame 0, or say with a map which joints are which"
-        )
-    return normalize(legs + trunk, dim=-1)
+    stands = max(lower) <= -ROUGHLY and max(arms, default=0.0) <= 0.9 and bool(across.any())
+    return normalize(legs + trunk, dim=-1) if stands else None
+
+
+def _lean(parts: Mapping[str, Tensor]) -> Tensor:
+    """Greatest angle between trunk or bones of the legs and the axis nearest to their direction, shape ``(*B)``."""
+    legs, trunk = _directions(parts)
+    direction = legs + trunk
+    nearest = direction.abs().argmax(-1, keepdim=True)
+    axis = torch.zeros_like(direction).scatter(-1, nearest, direction.gather(-1, nearest).sign())
+    lines = [trunk, *(normalize(parts[start] - parts[end], dim=-1) for start, end in bones(LEG))]
+    return torch.stack([(line * axis).sum(-1) for line in lines]).amin(0).clamp(-1, 1).acos()
+
+
+def _remedy(frames: Mapping[str, Tensor], skip: int) -> str:
+    """The frame that stands straightest, as the beginning of an instruction; nothing if none stands."""
+    straightest = int(_lean(frames).argmin())
+    if _body({part: places[straightest] for part, places in frames.items()}) is None:
+        return ""
+    return f"take one that does instead, the straightest (--rest-frame {skip + straightest}), or "
 
 
 def _nearest(direction: Tensor) -> str:

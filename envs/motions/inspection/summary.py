@@ -1,12 +1,17 @@
-"""A clip in four numbers."""
+"""A clip in six numbers."""
 
+import math
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.characters.kinematics import body_names, body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
+from torchrl_mcp.envs.motions.contacts import support
+from torchrl_mcp.envs.motions.soles import FLAT, soles
 from torchrl_mcp.envs.rotations import heading
 
 SWINGING = 1.0
@@ -14,6 +19,11 @@ SWINGING = 1.0
 
 RUNNING = 2.0
 """Speed in m/s above which people run; both feet of a runner are in the air when they pass each other."""
+
+NEAR = 0.05
+"""Height in metres of a sole above or below the ground up to which the foot should stand."""
+
+GRAVITY = 9.81
 
 
 class Summary(NamedTuple):
@@ -24,12 +34,16 @@ class Summary(NamedTuple):
         speed: Mean horizontal speed of the root, in m/s.
         turn_rate: Mean absolute rate of the root's heading, in rad/s.
         slide: See :func:`foot_slide`, in m/s.
+        sole: Median height of standing soles above the ground, in metres; NaN if no foot stands.
+        gliding: See :func:`gliding`, in m/s.
     """
 
     duration: float
     speed: float
     turn_rate: float
     slide: float
+    sole: float
+    gliding: float
 
 
 def summarised(clip: MotionClip) -> Summary:
@@ -42,22 +56,48 @@ def summarised(clip: MotionClip) -> Summary:
         speed=float(steps.mean() * clip.fps),
         turn_rate=float(turns.mean() * clip.fps),
         slide=foot_slide(clip),
+        sole=soles(clip).standing_height(),
+        gliding=gliding(clip),
     )
 
 
 def foot_slide(clip: MotionClip) -> float:
-    """Median horizontal speed of an ankle while the other one swings past it, in m/s; NaN without walking on two feet.
+    """Median horizontal speed of a foot while the other one swings past it, in m/s; NaN without walking on two feet.
 
     At that moment the foot should stand. If the rotations of a recording are read in the wrong order, it slides at 0.2
-    to 1 m/s.
+    to 1 m/s. Moments in which no foot is on the ground, as in jumps, rolls, cartwheels and crawls, are left out.
     """
     names, bodies = body_names(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
-    feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet]
+    feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet[:2]]
     if len(feet) < 2:
-        return float("nan")
-    speeds = bodies.linear_velocities[:, feet, :2].norm(dim=-1)
-    apart = (bodies.positions[:, feet[0], :2] - bodies.positions[:, feet[1], :2]).norm(dim=-1)
-    walking = (speeds.amax(-1) > SWINGING) & (bodies.linear_velocities[:, 0, :2].norm(dim=-1) < RUNNING)
+        return math.nan
+    velocities, places = bodies.linear_velocities[..., :2], bodies.positions[..., :2]
+    first, second = feet
+    swinging = (velocities[:, first] - velocities[:, second]).norm(dim=-1) > SWINGING
+    walking = swinging & (velocities[:, 0].norm(dim=-1) < RUNNING)
+    apart = (places[:, first] - places[:, second]).norm(dim=-1)
     passing = (apart[1:-1] < apart[:-2]) & (apart[1:-1] <= apart[2:]) & walking[1:-1]
-    slides = speeds[1:-1][passing].amin(-1)
-    return float(slides.quantile(0.5)) if len(slides) else float("nan")
+    speed, slower = velocities[:, feet].norm(dim=-1).min(-1)
+    on_ground = _on_ground(clip).gather(1, slower.unsqueeze(-1)).squeeze(-1)
+    slides = speed[1:-1][passing & on_ground[1:-1]]
+    return float(slides.quantile(0.5)) if len(slides) else math.nan
+
+
+def gliding(clip: MotionClip) -> float:
+    """Median speed of the slowest of the lowest points of the body, in m/s; NaN if it falls or runs all the time.
+
+    While it does neither, something should rest on the ground, whatever the motion: feet, knees, hands, or the back. If
+    the rotations of a recording are read in the wrong order, so that the body tumbles, everything glides at 1 m/s.
+    """
+    model, states = character_model(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
+    masses = torch.from_numpy(model.body_mass[1:] / model.body_mass[1:].sum())
+    (acceleration,) = torch.gradient(states.linear_velocities[..., 2] @ masses, spacing=1 / clip.fps)
+    carried = (acceleration > -GRAVITY / 2) & (states.linear_velocities[:, 0, :2].norm(dim=-1) < RUNNING)
+    speeds = support(clip.character, states).speeds[carried]
+    return float(speeds.median()) if len(speeds) else math.nan
+
+
+def _on_ground(clip: MotionClip) -> Tensor:
+    """Whether each foot is close to the ground and not far from level, shape ``(T, F)``, bool."""
+    feet = soles(clip)
+    return (feet.heights.abs() < NEAR) & (feet.tilts < 2 * FLAT)

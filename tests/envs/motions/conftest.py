@@ -1,5 +1,10 @@
+import math
+
 import mujoco
+import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
 from torchrl_mcp.envs.characters.joints import character_model
 
@@ -48,3 +53,33 @@ def kinematics():
         return dict(zip(names, data.xpos.copy(), strict=True)), dict(zip(names, orientations, strict=True))
 
     return kinematics
+
+
+@pytest.fixture(scope="session")
+def turned():
+    """A rotation about an axis by degrees."""
+
+    def turned(axis, degrees):
+        return Rotation.from_rotvec(math.radians(degrees) * np.asarray(axis, float))
+
+    return turned
+
+
+@pytest.fixture(scope="session")
+def posed():
+    """States of the humanoid from frames of a position of the root and of rotations or angles by joint."""
+
+    def posed(frames):
+        model = character_model("humanoid")
+        qpos = np.tile(model.qpos0, (len(frames), 1))
+        for row, (position, joints) in zip(qpos, frames, strict=True):
+            row[:3] = position
+            for name, value in joints.items():
+                start = model.joint(name).qposadr[0] + (3 if name == "root" else 0)
+                if isinstance(value, Rotation):
+                    row[start : start + 4] = value.as_quat(scalar_first=True)
+                else:
+                    row[start] = value
+        return torch.from_numpy(qpos)
+
+    return posed

@@ -214,6 +214,27 @@ def test_a_body_model_of_another_kind_is_refused(write, tmp_path):
         import_motion(write(**GOOD, betas=np.zeros(10)), "humanoid", body_model=tmp_path / "nowhere.npz")
 
 
+@pytest.mark.parametrize("names", [("poses",), ("root_orient", "pose_body")], ids=str)
+def test_degrees_are_recognised_and_their_conversion_is_the_remedy(write, walk, names):
+    poses, trans = smpl(walk, "y")
+    rest = {"trans": trans, "fps": walk.fps}
+    columns = {"poses": poses, "root_orient": poses[:, :3], "pose_body": poses[:, 3:]}
+    for convert, refused in ((np.degrees, True), (np.copy, False)):
+        path = write(**{name: convert(columns[name]) for name in names}, **rest)
+        if refused:
+            with pytest.raises(MotionFormatError, match=rf"{names[-1]} .* in degrees: convert .* numpy\.radians"):
+                import_motion(path, "humanoid")
+        else:
+            assert max(deviations(import_motion(path, "humanoid", rate=walk.fps), walk)) < 1.0
+
+
+def test_a_dancer_whose_turns_are_counted_is_not_in_degrees(write):
+    spins = np.zeros((120, 66))
+    spins[:, 1] = np.linspace(0, 6 * np.pi, 120)
+    path = write(poses=spins, trans=np.zeros((120, 3)), fps=30.0)
+    assert import_motion(path, "humanoid").duration == pytest.approx(119 / 30)
+
+
 def test_rotations_of_root_and_body_are_equally_many(write):
     parts = {"root_orient": np.zeros((3, 3)), "pose_body": np.zeros((5, 63)), "trans": np.zeros((5, 3))}
     with pytest.raises(MotionFormatError, match="has 3 rotations in root_orient and 5 in pose_body"):

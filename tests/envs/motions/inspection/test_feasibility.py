@@ -8,7 +8,7 @@ import torch
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
-from torchrl_mcp.envs.motions.capture.joint_motion import grounded
+from torchrl_mcp.envs.motions.capture.ground import grounded
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import walk
 from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
@@ -60,9 +60,10 @@ def test_decoration_neither_stands_nor_sinks(tmp_path, monkeypatch):
         monkeypatch.setitem(CHARACTERS, name, replace(CHARACTERS["biped"], name=name, file=tmp_path / f"{name}.xml"))
     clip = posed("decorated")
     assert feasibility(clip) == feasibility(posed("biped"))
-    torch.testing.assert_close(grounded("decorated", clip.qpos), clip.qpos)
+    times = torch.arange(len(clip.qpos), dtype=torch.float64)
+    torch.testing.assert_close(grounded("decorated", clip.qpos, times)[0], clip.qpos)
     with pytest.raises(ValueError, match="left_ankle has no shape that collides: draw one, or name other feet"):
-        grounded("footless", clip.qpos)
+        grounded("footless", clip.qpos, times)
 
 
 def test_height_above_the_ground_is_no_support():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_mcp.envs.motions.capture.importer import import_motion
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 
 STUDIO = {
@@ -48,12 +49,27 @@ def limbs(name, form, parts):
     return form.format(long=long, side=long[0], small=long[0].lower(), part=parts.get(part, part))
 
 
+VROID = {
+    "UpLeg": "UpperLeg",
+    "Leg": "LowerLeg",
+    "Foot": "Foot",
+    "Shoulder": "Shoulder",
+    "Arm": "UpperArm",
+    "ForeArm": "LowerArm",
+}
+
+
+def vroid(name):
+    return limbs(name, "J_Bip_{side}_{part}", VROID) if name[:4] in ("Left", "Righ") else f"J_Bip_C_{name}"
+
+
 CONVENTIONS = {
     "prefixed": lambda name: f"mixamorig:{name}",
     "3ds Max": lambda name: f"Bip01 {limbs(name, '{side} {part}', STUDIO)}",
     "Biovision": lambda name: limbs(name, "{long}{part}", BIOVISION),
     "SMPL": lambda name: limbs(name, "{side}_{part}", BIOVISION),
     "engine": lambda name: limbs(name, "{part}_{small}", ENGINE),
+    "VRM": vroid,
     "CMU": lambda name: limbs(name, "{small}{part}", CMU),
 }
 
@@ -93,6 +109,15 @@ def test_the_example_of_the_error_is_a_joint_of_that_name_or_none(load):
         load([{}] * 2, rename=lambda name: {"Head": "Tete", "Neck": "Cou"}.get(name, name))
     with pytest.raises(MotionFormatError, match=r"such as left_knee=JOINT; its joints"):
         load([{}] * 2, rename=lambda name: {"LeftLeg": "Gauche2"}.get(name, name))
+
+
+def test_the_example_of_the_error_is_no_end_site(bvh, tmp_path):
+    text = bvh([{}] * 2, rename=lambda name: {"Head": "UpperHeadJoint", "Neck": "LowerNeckJoint"}.get(name, name))
+    head = text.index("}", text.index("UpperHeadJoint"))
+    path = tmp_path / "motion.bvh"
+    path.write_text(f"{text[:head]}End Site\n{{\nOFFSET 0 0.1 0\n}}\n{text[head:]}")
+    with pytest.raises(MotionFormatError, match=r"no joint known as neck: .* such as neck=UpperHeadJoint; its joints"):
+        import_motion(path, "humanoid")
 
 
 @pytest.mark.parametrize("head", ["torso_head", "Head", "UpperNeck"])

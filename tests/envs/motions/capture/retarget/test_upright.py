@@ -107,7 +107,7 @@ def test_a_rest_pose_that_sits_is_refused_though_its_legs_point_along_an_axis(sk
         return (offset[0], offset[2], -offset[1]) if name.endswith(("Leg", "Foot", "Toe")) else offset
 
     body = [(name, parent, seated(name, offset)) for name, parent, offset in skeleton]
-    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand .* --rest-frame 0"):
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand"):
         load([{}] * 2, body=body)
 
 
