@@ -76,9 +76,9 @@ FAULTS = {
         ('stored=("gates", *PRIMITIVES)', 'stored=("gates",)', "methods/test_composite.py methods/test_contract.py"),
         ('    require_frozen("primitives", frozen, over="weights")\n', "", "methods/test_exploration_over_weights.py"),
     ],
-    "conf/method/moe.yaml": [("override /mixer: additive", "override /mixer: multiplicative", "test_methods.py")],
+    "conf/method/moe.yaml": [("override /mixer: additive", "override /mixer: multiplicative", "test_composition.py")],
     "torchrl_mcp/methods/scratch.py": [
-        ("in_keys=[STATE, GOAL]", 'in_keys=["observation", GOAL]', "methods/test_contract.py test_methods.py"),
+        ("in_keys=[STATE, GOAL]", 'in_keys=["observation", GOAL]', "methods/test_contract.py"),
     ],
     "torchrl_mcp/methods/finetune.py": [
         (".requires_grad_(not blind)", ".requires_grad_(blind)", "methods/test_finetune.py"),
