@@ -8,13 +8,14 @@ LATEST := build/latest
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-processors test-slow test-latest check docs linkcheck format bench clean
+.PHONY: help demo install test test-faults test-processors test-slow test-latest check docs linkcheck format bench clean
 
 help:
 	@echo "make demo       install, then run the demonstration"
 	@echo "make install    create .venv and install the pinned versions"
 	@echo "make test       every test but the learning tests"
 	@echo "make test-processors  the tests of trajectories with the kernels and roundings of other processors"
+	@echo "make test-faults  whether the tests catch plausible faults of the library"
 	@echo "make test-latest  the same with the newest packages that pyproject.toml admits"
 	@echo "make test-slow  the learning tests"
 	@echo "make check      format, lint, types, doctests"
@@ -44,6 +45,10 @@ test: $(STAMP)
 # The tests whose outcome is chaotic, as on processors that are not at hand: a quarter of an hour.
 test-processors: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/support/processors.py
+
+# Two hundred faults, one at a time: half an hour.
+test-faults: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/support/faults.py
 
 test-slow: $(STAMP)
 	$(PYTEST) -n 2 --dist loadfile -m slow

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from refusals import refused
 
 from torchrl_mcp import conf
 from torchrl_mcp.runs.configuration import compose_run
@@ -52,12 +53,16 @@ def test_a_task_takes_its_own_character_and_refuses_those_that_cannot_do_it_with
             require_environment(cfg)
             assert OmegaConf.to_container(cfg, resolve=True)["parts"]["_target_"].startswith("torchrl_mcp.")
             continue
-        with pytest.raises(ValueError, match="task=") as refusal:
-            require_environment(cfg)
-        remedy = "stage=transfer" if stage not in stages else f"pass character={' or '.join(sorted(able))}"
-        if task == "imitation" and stage == "transfer":
-            remedy = "task=imitation"
-        assert remedy in str(refusal.value)
+        remedy = "stage=transfer" if stage not in stages else f"character={' or '.join(sorted(able))}"
+        refused(lambda: require_environment(cfg), f"task={task}", remedy)
+
+
+@pytest.mark.parametrize(
+    ("method", "mixer", "activation"), [("mcp", "multiplicative", "Sigmoid"), ("moe", "additive", "Softmax")]
+)
+def test_a_mixture_of_experts_differs_from_mcp_in_mixer_and_gate(method, mixer, activation):
+    cfg = composed(f"method={method}")
+    assert (cfg.mixer.name, cfg.gating.activation._target_) == (mixer, f"torch.nn.{activation}")
 
 
 @pytest.mark.parametrize("character", sorted(WALKERS))

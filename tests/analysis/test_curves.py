@@ -7,6 +7,7 @@ from matplotlib import _pylab_helpers
 from matplotlib.colors import same_color, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from refusals import refused
 
 from torchrl_mcp.analysis import draw_curves, learning_curves, read_metrics, save_figure, write_curves
 from torchrl_mcp.analysis.curves import plot_curves
@@ -88,20 +89,12 @@ def test_a_run_that_has_not_begun_has_no_rows(tmp_path):
     assert read_metrics(tmp_path) == []
 
 
-def test_a_missing_column_is_an_error_that_lists_the_columns(tmp_path):
-    with pytest.raises(ValueError, match=r"no 'speed' in metrics.csv: .*'frames'"):
-        learning_curves({"mcp": [constant_run(tmp_path / "run", 1.0)]}, quantity="speed")
-
-
-def test_a_run_without_an_episode_yet_is_an_error(tmp_path):
-    run = write_run(tmp_path / "run", [(100, 0, "nan")])
-    with pytest.raises(ValueError, match="let it run until episodes of full length have ended"):
-        learning_curves({"mcp": [run]})
-
-
-def test_a_group_without_runs_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"\['scratch'\] name no run folder"):
-        learning_curves({"mcp": [constant_run(tmp_path / "run", 1.0)], "scratch": []})
+def test_what_has_no_curve_is_refused(tmp_path):
+    runs = {"mcp": [constant_run(tmp_path / "run", 1.0)]}
+    refused(lambda: learning_curves(runs, quantity="speed"), "'speed'", "'frames'")
+    refused(lambda: learning_curves(runs | {"scratch": []}), "'scratch'")
+    unfinished = write_run(tmp_path / "unfinished", [(100, 0, "nan")])
+    refused(lambda: learning_curves({"mcp": [unfinished]}), str(unfinished))
 
 
 def test_the_written_rows_hold_the_numbers_of_the_curves(tmp_path):

@@ -61,23 +61,23 @@ def test_help_and_version_import_no_slow_library(word):
 
 
 @pytest.mark.parametrize(
-    ("command", "words", "answer"),
+    ("command", "words"),
     [
-        ("torchrl-mcp-play", ["nowhere"], "there is no nowhere: give a run folder"),
-        ("torchrl-mcp-play", ["builtin:horse"], "no builtin:horse comes with the library: give one of builtin:biped"),
-        ("torchrl-mcp-play", ["builtin:biped", "--output", "film.avi"], "film.avi is not the name of a film"),
-        ("torchrl-mcp-evaluate", ["nowhere"], "there is no nowhere: give a run folder"),
-        ("torchrl-mcp-figures", ["primitives", "nowhere"], "there is no nowhere: give a run folder"),
-        ("torchrl-mcp-motions", ["inspect", "nowhere.bvh"], "there is no nowhere.bvh"),
-        ("torchrl-mcp-report", ["nowhere"], "there is no folder nowhere"),
-        ("torchrl-mcp-status", ["nowhere"], "there is no folder nowhere"),
+        ("torchrl-mcp-play", ["nowhere"]),
+        ("torchrl-mcp-play", ["builtin:horse"]),
+        ("torchrl-mcp-play", ["builtin:biped", "--output", "film.avi"]),
+        ("torchrl-mcp-evaluate", ["nowhere"]),
+        ("torchrl-mcp-figures", ["primitives", "nowhere"]),
+        ("torchrl-mcp-motions", ["inspect", "nowhere.bvh"]),
+        ("torchrl-mcp-report", ["nowhere"]),
+        ("torchrl-mcp-status", ["nowhere"]),
     ],
 )
-def test_a_simple_error_imports_no_slow_library(command, words, answer):
+def test_a_simple_error_names_what_is_wrong_and_imports_no_slow_library(command, words):
     outcome, imported = call(command, *words)
     assert outcome.returncode
     assert imported == ""
-    assert answer in outcome.stderr
+    assert words[-1] in outcome.stderr
 
 
 @pytest.mark.parametrize("words", [["method=horse"], ["sead=1"], ["task=heading", "--cfg", "job"]])

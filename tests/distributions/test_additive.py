@@ -157,18 +157,6 @@ def test_a_primitive_with_a_subnormal_gate_counts_where_it_alone_explains_the_ac
         torch.testing.assert_close(gradient[1] * gates[1].detach(), torch.tensor(1.0))
 
 
-def test_the_mode_is_refused_with_the_remedy():
-    with pytest.raises(NotImplementedError, match="deterministic_sample"):
-        _ = AdditiveGaussian(*random_primitives()).mode
-
-
-def test_rsample_is_refused_with_the_limit_and_the_remedy():
-    policy = AdditiveGaussian(*random_primitives())
-    assert not policy.has_rsample
-    with pytest.raises(NotImplementedError, match=r"comes from one primitive.*PPO.*SAC.*TanhMultiplicativeGaussian"):
-        policy.rsample()
-
-
 @pytest.mark.parametrize("action_dim", [1, 2])
 def test_kl_divergence_has_the_value_and_the_gradient_of_the_integral(action_dim):
     torch.manual_seed(0)

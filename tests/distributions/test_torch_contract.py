@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from refusals import refused
 from torch.export import Dim, export
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian, TanhMultiplicativeGaussian
@@ -48,10 +49,16 @@ def test_a_number_is_the_same_scale_for_all_primitives_and_actions(distribution_
     assert torch.equal(half.scale, torch.full((5, 3, 2), 0.7))  # not rounded to bfloat16
 
 
-@pytest.mark.parametrize("name", ["cdf", "icdf"])
-def test_a_cumulative_distribution_is_refused_with_the_remedy(distribution_class, name, random_primitives):
-    with pytest.raises(NotImplementedError, match=f"{distribution_class.__name__} has no {name}.*samples"):
-        getattr(distribution_class(*random_primitives()), name)(torch.zeros(2))
+@pytest.mark.parametrize("name", ["cdf", "icdf", "mode", "rsample"])
+def test_what_has_no_closed_form_is_refused(distribution_class, name, random_primitives):
+    policy = distribution_class(*random_primitives())
+    if name == "mode" and distribution_class is MultiplicativeGaussian:
+        assert torch.equal(policy.mode, policy.mean)
+    elif name == "rsample" and distribution_class is not AdditiveGaussian:
+        assert policy.rsample().shape == (2,)
+    else:
+        remedy = {"mode": "deterministic_sample", "rsample": "TanhMultiplicativeGaussian"}.get(name, name)
+        refused(lambda: getattr(policy, name)(torch.zeros(2)), remedy, error=NotImplementedError)
 
 
 def test_a_batch_equals_its_rows_one_by_one(distribution_class, random_primitives):

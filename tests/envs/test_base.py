@@ -1,5 +1,6 @@
 import pytest
 import torch
+from refusals import refused
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -63,15 +64,13 @@ def test_setting_the_seed_again_repeats_the_trajectory():
 def test_a_reset_may_give_the_seed_and_refuses_what_it_does_not_know():
     first, other = make(seed=1), make(seed=2)
     assert torch.equal(first.reset(seed=5)["observation"], other.reset(seed=5)["observation"])
-    with pytest.raises(TypeError, match="sead"):
-        first.reset(sead=5)
+    refused(lambda: first.reset(sead=5), "'sead'", error=TypeError)
 
 
 def test_the_physics_does_not_move_to_another_device():
     env = make()
     assert env.to("cpu") is env
-    with pytest.raises(ValueError, match=r"device=cuda: the physics stays on cpu\. Move what"):
-        env.to("cuda")
+    refused(lambda: env.to("cuda"), "device=cuda", "cpu")
 
 
 def test_a_reset_of_nobody_changes_nothing():
@@ -281,45 +280,41 @@ def test_a_state_may_be_set_in_some_simulations_only():
 
 
 @pytest.mark.parametrize(
-    ("change", "match"),
+    ("change", "names"),
     [
-        (lambda s: s.exclude("qvel"), "without \\['qvel'\\]"),
-        (lambda s: s.set("qpos", torch.zeros(4, 14)), "qpos has shape \\(4, 14\\): pass \\(4, 15\\)"),
-        (lambda s: s.set("speed", torch.zeros(4)), "'speed' is no part of the state"),
-        (lambda s: s.set("qvel", torch.full((4, 14), float("nan"))), "qvel is not finite"),
-        (lambda s: s.set("qvel", torch.full((4, 14), 1e11)), "beyond MuJoCo's limit"),
+        (lambda s: s.exclude("qvel"), ["'qvel'"]),
+        (lambda s: s.set("qpos", torch.zeros(4, 14)), ["qpos", "(4, 14)", "(4, 15)"]),
+        (lambda s: s.set("speed", torch.zeros(4)), ["'speed'"]),
+        (lambda s: s.set("qvel", torch.full((4, 14), float("nan"))), ["qvel"]),
+        (lambda s: s.set("qvel", torch.full((4, 14), 1e11)), ["qvel", "1e+10"]),
+        (lambda s: None, ["'qpos'", "'qvel'"]),
     ],
 )
-def test_a_state_that_does_not_fit_is_refused(change, match):
+def test_a_state_that_does_not_fit_is_refused(change, names):
     env = make()
     env.reset()
-    with pytest.raises(ValueError, match=match):
-        env.reset(change(env.get_state()), set_state=True)
-
-
-def test_setting_no_state_is_refused():
-    with pytest.raises(ValueError, match="qpos and qvel"):
-        make().reset(set_state=True)
+    refused(lambda: env.reset(change(env.get_state()), set_state=True), *names)
 
 
 @pytest.mark.parametrize("action", [torch.zeros(4, 7), torch.zeros(4, 8, 1), torch.zeros(4, 8, device="meta")])
 def test_an_action_that_does_not_fit_is_refused(action):
     env = make()
     env.reset()
-    with pytest.raises(ValueError, match="action has shape"):
-        env.step(TensorDict({"action": action}, [4]))
+    refused(lambda: env.step(TensorDict({"action": action}, [4])), "action", "(4, 8)")
 
 
-@pytest.mark.parametrize("argument", [{"num_envs": 0}, {"num_envs": -3}, {"max_episode_steps": 0}, {"num_threads": -1}])
-def test_a_count_out_of_range_is_refused(argument):
-    with pytest.raises(ValueError, match=f"{next(iter(argument))}="):
-        make(**argument)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is available")
-def test_pinned_memory_needs_cuda():
-    with pytest.raises(ValueError, match="pin_memory=True"):
-        make(pin_memory=True)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_envs", 0),
+        ("num_envs", -3),
+        ("max_episode_steps", 0),
+        ("num_threads", -1),
+        pytest.param("pin_memory", True, marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has CUDA")),
+    ],
+)
+def test_an_argument_out_of_range_is_refused(name, value):
+    refused(lambda: make(**{name: value}), f"{name}={value}")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

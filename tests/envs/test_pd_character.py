@@ -144,21 +144,6 @@ def test_pyramidal_cones_have_edges_along_the_axes():
     assert drift("biped", "pyramidal", math.pi / 2) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"character": "ant"}, "character='ant' is unknown: pass one of biped, humanoid, trex"),
-        ({"physics_timestep": 0.007}, "physics_timestep=0.007 does not divide the control step"),
-        ({"physics_timestep": 0.1}, "physics_timestep=0.1 does not divide the control step"),
-        ({"friction_cone": "round"}, "friction_cone='round' is unknown: pass one of pyramidal, elliptic"),
-        ({"num_envs": 0}, "num_envs=0"),
-    ],
-)
-def test_wrong_arguments_are_named_with_a_remedy(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(**arguments)
-
-
 @every_character
 def test_a_finer_time_step_takes_more_substeps(character):
     env = make(character, 1, physics_timestep=1 / 240)

@@ -3,14 +3,14 @@
 import pytest
 import torch
 from hydra.utils import instantiate
+from refusals import refused
 from tensordict import TensorDict
 from torch import nn
-from torch.overrides import TorchFunctionMode
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 from torchrl_mcp.methods.actor import Sizes
-from torchrl_mcp.methods.mcp import _normalised_inputs, composite_actor
+from torchrl_mcp.methods.mcp import composite_actor
 from torchrl_mcp.runs.configuration import compose_run
 
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
@@ -28,20 +28,10 @@ def test_the_composite_starts_at_the_standard_deviation_asked_for(num_primitives
         torch.testing.assert_close(stddev, torch.full_like(stddev, 0.17), atol=0, rtol=tolerance)
 
 
-class GeneratorsOfTheirDevice(TorchFunctionMode):
-    """Random numbers of a device need its own generator, as on a GPU."""
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
-        if func is torch.randn:
-            assert torch.device(kwargs["device"]) == kwargs["generator"].device
-        return func(*args, **kwargs)
-
-
-def test_inputs_that_tell_the_initial_spread_are_drawn_for_any_default_device():
-    with GeneratorsOfTheirDevice(), torch.device("meta"):
-        states, goals = _normalised_inputs(3, 2)
-    assert states.device.type == goals.device.type == "meta"
+@pytest.mark.parametrize("num_primitives", [0, -1])
+def test_a_composite_of_nothing_is_refused(num_primitives, composite):
+    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+    refused(lambda: composite(**heads, num_primitives=num_primitives), "num_primitives")
 
 
 @pytest.mark.parametrize("method", ["mcp", "moe"])
@@ -156,5 +146,5 @@ def infinite(logits):
 
 @pytest.mark.parametrize("activation", [nn.ReLU(), negative, infinite], ids=["all zero", "negative", "infinite"])
 def test_weights_that_compose_nothing_are_refused_before_training(composite, activation):
-    with pytest.raises(ValueError, match="end it with a sigmoid, a softmax or a softplus"):
-        composite(gate_activation=activation, distribution_class=MultiplicativeGaussian)
+    heads = {"gate_activation": activation, "distribution_class": MultiplicativeGaussian}
+    refused(lambda: composite(**heads), "gating.activation")

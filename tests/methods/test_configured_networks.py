@@ -3,6 +3,7 @@
 import pytest
 import torch
 from hydra.utils import instantiate
+from refusals import refused
 from torch import nn
 
 from torchrl_mcp.methods.actor import Sizes
@@ -94,5 +95,4 @@ def test_width_scales_every_hidden_layer_of_every_network(method, stage):
 
 
 def test_a_width_without_units_is_refused():
-    with pytest.raises(ValueError, match="width=0"):
-        instantiate(compose_run("width=0.0").parts)(Sizes(105, 2, 17))
+    refused(lambda: instantiate(compose_run("width=0.0").parts)(Sizes(105, 2, 17)), "width=0.0")

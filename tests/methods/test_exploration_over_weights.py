@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 from torch.distributions import Independent, Normal
 
@@ -51,15 +52,17 @@ def test_the_noise_of_the_logits_can_be_learned(composite, states):
     torch.testing.assert_close(log_std.grad, torch.full((4,), 50 * ((2.0 / 0.4) ** 2 - 1)))
 
 
-@pytest.mark.parametrize("frozen", [(), ("observation_normaliser",)])
-def test_exploration_over_weights_refuses_primitives_that_are_not_frozen(frozen, composite):
+@pytest.mark.parametrize(
+    ("frozen", "std", "names"),
+    [
+        ((), 0.2, ("transfer.freeze", "exploration=action")),
+        (("observation_normaliser",), 0.2, ("transfer.freeze", "exploration=action")),
+        (("primitives",), 0.0, ("logits_std",)),
+        (("primitives",), -0.2, ("logits_std",)),
+        (("primitives",), float("nan"), ("logits_std",)),
+    ],
+)
+def test_free_primitives_and_an_impossible_standard_deviation_are_refused(frozen, std, names, composite):
     heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
-    with pytest.raises(ValueError, match=r"primitives.*transfer\.freeze.*exploration=action"):
-        weights_actor(composite(**heads), **heads, logits_std=0.2, frozen=frozen)
-
-
-@pytest.mark.parametrize("std", [0.0, -0.2, float("nan")])
-def test_exploration_over_weights_refuses_an_impossible_standard_deviation(std, composite):
-    heads = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
-    with pytest.raises(ValueError, match="logits_std"):
-        weights_actor(composite(**heads), **heads, logits_std=std, frozen=["primitives"])
+    parts = composite(**heads)
+    refused(lambda: weights_actor(parts, **heads, logits_std=std, frozen=frozen), *names)

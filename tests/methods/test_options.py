@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 
 from torchrl_mcp.methods.options import EpsilonGreedy, SeparateOptions, Terminations, WhereBeginning, option_diagnostics
@@ -109,5 +110,4 @@ def test_an_empty_batch_has_empty_outputs():
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.1, float("nan")])
 def test_a_random_choice_needs_a_probability(epsilon):
-    with pytest.raises(ValueError, match=f"epsilon={epsilon} is no probability"):
-        EpsilonGreedy(torch.zeros(K), epsilon)
+    refused(lambda: EpsilonGreedy(torch.zeros(K), epsilon), f"epsilon={epsilon}")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import refused
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import Binary, Composite, Unbounded
@@ -134,8 +135,8 @@ def test_the_clip_that_is_followed_says_which_option_acts_in_and_after_every_ste
 
 
 def test_as_many_options_as_clips_are_needed():
-    with pytest.raises(ValueError, match=r"num_options=7 .* there are 3.*motions=turning"):
-        TransformedEnv(Lengths(), ClipAsOption(num_options=7)).observation_spec  # noqa: B018
+    env = TransformedEnv(Lengths(), ClipAsOption(num_options=7))
+    refused(lambda: env.observation_spec, "num_options=7", "3")
 
 
 def test_environments_with_a_memory_are_put_into_a_state_and_saved_as_a_whole():

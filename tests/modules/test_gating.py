@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 from torch.nn import functional as F
 
@@ -117,8 +118,7 @@ def test_diagnostics_are_scalars_for_any_batch_and_carry_no_gradient():
 
 @pytest.mark.parametrize("num_cells", [(), [], 64])
 def test_a_gate_without_a_list_of_layers_is_refused(num_cells):
-    with pytest.raises(ValueError, match=r"is no list of layers: pass the units of at least one, such as \[64\]"):
-        JointGating(3, 2, 4, num_cells=num_cells)
+    refused(lambda: JointGating(3, 2, 4, num_cells=num_cells), f"num_cells={num_cells}")
 
 
 def test_the_width_of_saturation_is_an_argument():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 
 from torchrl_mcp.modules import GaussianPolicy, InjectedPolicy
@@ -59,13 +60,10 @@ def test_a_standard_deviation_that_learns_shrinks_where_noise_costs_reward(netwo
 
 @pytest.mark.parametrize("std", [0.0, 1e-5, -0.1, float("nan"), [0.1, 0.2], [0.1, -0.1, 0.1]])
 def test_an_impossible_standard_deviation_is_refused(std):
-    with pytest.raises(ValueError, match=r"std must be one number of at least 0\.0001 or 3"):
-        GaussianPolicy(27, 2, 3, std=std)
-
-
-def test_noise_that_begins_anew_below_torchrl_s_limit_is_refused():
-    with pytest.raises(ValueError, match=r"std must be at least 0\.0001, got 1e-05"):
-        restart_noise(GaussianPolicy(5, 2, 3), 1e-5)
+    for make in (lambda: GaussianPolicy(27, 2, 3, std=std), lambda: InjectedPolicy(27, 3, std=std)):
+        refused(make, "std", str(std))
+    if std == 1e-5:
+        refused(lambda: restart_noise(GaussianPolicy(5, 2, 3), std), "std", "1e-05")
 
 
 @pytest.mark.parametrize("learned", [True, False])

@@ -2,6 +2,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 from torchrl_mcp.modules import RunningNormaliser
 
@@ -76,13 +77,9 @@ def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
     assert x.grad.ne(0).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [({"size": 0}, "size"), ({"size": 3, "clip": 0.0}, "clip"), ({"size": 3, "clip": -1.0}, "clip")],
-)
-def test_impossible_arguments_are_refused_by_name(arguments, name):
-    with pytest.raises(ValueError, match=name):
-        RunningNormaliser(**arguments)
+@pytest.mark.parametrize(("name", "value"), [("size", 0), ("clip", 0.0), ("clip", -1.0)])
+def test_impossible_arguments_are_refused_by_name(name, value):
+    refused(lambda: RunningNormaliser(**{"size": 3, name: value}), name)
 
 
 @pytest.mark.parametrize("outlier", [1e9, -1e9, float("nan"), float("inf")])
@@ -93,11 +90,11 @@ def test_a_sample_out_of_all_bounds_leaves_the_statistics_alone_and_is_told(outl
     expected.update(x)
     spoilt = torch.cat([x, x[:1]])
     spoilt[-1, 1] = outlier
-    with pytest.warns(UserWarning, match=r"1 of 101 samples have features beyond 100000 .*scale features \[1\]"):
+    with pytest.warns(UserWarning, match=r"1 of 101 .*\[1\]"):
         normaliser.update(spoilt)
     for name, buffer in normaliser.named_buffers():
         assert torch.equal(buffer, getattr(expected, name)), name
-    with pytest.warns(UserWarning, match="1 of 1 samples"):
+    with pytest.warns(UserWarning, match="1 of 1 "):
         normaliser.update(spoilt[-1:])
     assert normaliser.count == 100
 
@@ -115,6 +112,5 @@ def test_statistics_have_the_precision_of_the_buffers_whatever_the_samples_have(
 def test_another_number_of_features_is_refused_instead_of_broadcast(width):
     normaliser = RunningNormaliser(4)
     for use in (normaliser, normaliser.update):
-        with pytest.raises(ValueError, match=f"x is \\(2, {width}\\): its last dimension must have 4 features"):
-            use(torch.ones(2, width))
+        refused(lambda use=use: use(torch.ones(2, width)), f"(2, {width})", "4")
     assert not normaliser.mean.any()

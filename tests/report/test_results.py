@@ -1,9 +1,9 @@
 import json
 import math
-import re
 import shutil
 
 import pytest
+from refusals import refused
 
 from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.results import Damaged, Run, find_runs, read_run
@@ -84,38 +84,30 @@ def test_an_episode_that_has_not_ended_is_no_learning_curve(write_run):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "reason"),
+    ("file", "content"),
     [
-        (
-            "metrics.csv",
-            "iteration,frames\n1,many\n",
-            "metrics.csv cannot be read: .*metrics.csv:2 is damaged: could not convert .*'many'",
-        ),
-        ("metrics.csv", "iteration,frames\n1,100\n", "metrics.csv cannot be read: it lacks 'seconds'"),
-        ("metrics.csv", b"\xff\xfe\xff", "metrics.csv cannot be read: .*decode"),
-        ("evaluation.json", '{"episodes": 1', "evaluation.json cannot be read: Expecting"),
-        ("evaluation.json", '{"deterministic": {}}', "evaluation.json cannot be read: it lacks 'normalised_return'"),
-        ("evaluation.json", "[]", "evaluation.json cannot be read"),
-        ("evaluation.json", "[" * 100_000, "evaluation.json cannot be read: it is nested too deeply"),
-        (
-            "metrics.csv",
-            "iteration,frames,seconds\n1,1e300,1\n",
-            "metrics.csv cannot be read: its frames are not numbers",
-        ),
-        ("metrics.csv", "iteration,frames,seconds\n1,9,1\n2,10\n", "metrics.csv cannot be read: its last row has no"),
-        ("origin.json", '{"commit": [1]}', "origin.json cannot be read: its commit is"),
-        ("origin.json", "", "origin.json cannot be read: Expecting value"),
-        ("origin.json", '{"choices": []}', "origin.json cannot be read"),
+        ("metrics.csv", "iteration,frames\n1,many\n"),
+        ("metrics.csv", "iteration,frames\n1,100\n"),
+        ("metrics.csv", b"\xff\xfe\xff"),
+        ("metrics.csv", "iteration,frames,seconds\n1,1e300,1\n"),
+        ("metrics.csv", "iteration,frames,seconds\n1,9,1\n2,10\n"),
+        ("evaluation.json", '{"episodes": 1'),
+        ("evaluation.json", '{"deterministic": {}}'),
+        ("evaluation.json", "[]"),
+        ("evaluation.json", "[" * 100_000),
+        ("origin.json", '{"commit": [1]}'),
+        ("origin.json", ""),
+        ("origin.json", '{"choices": []}'),
     ],
 )
-def test_a_damaged_file_is_named_with_the_reason(write_run, file, content, reason):
+def test_a_damaged_file_is_named(write_run, file, content):
     folder = write_run("run", score=0.5)
     (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
     run = read_run(folder)
     assert isinstance(run, Run)
     assert run.state == "damaged"
     assert run.settings["method.name"] == "scratch"
-    assert re.match(reason, run.fault), run.fault
+    assert run.fault.startswith(f"{file} ")
 
 
 def test_an_evaluation_may_lack_its_environment(write_run):
@@ -127,36 +119,33 @@ def test_an_evaluation_may_lack_its_environment(write_run):
 
 def test_a_return_that_is_no_number_is_a_damage(write_run):
     run = read_run(write_run("run", score=math.nan))
-    assert run.fault == "evaluation.json cannot be read: the deterministic normalised return is nan"
+    assert run.fault.startswith("evaluation.json ")
+    assert "nan" in run.fault
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
+    ("content", "names"),
     [
-        ("method: [", "config.yaml cannot be read: .*while parsing"),
-        ("method: {name: mcp}", "config.yaml has no valid task.name, character.name, stage.name, seed, training"),
-        ("- 1", "config.yaml cannot be read: .*holds no settings"),
-        ("seed: ${nowhere}", "config.yaml has no valid task.name.* seed"),
-        ("a: &a [1]\nb: *a", "config.yaml cannot be read: .*refers to parts of itself"),
+        ("method: [", []),
+        ("method: {name: mcp}", ["task.name", "character.name", "stage.name", "seed", "training.total_frames"]),
+        ("- 1", []),
+        ("seed: ${nowhere}", ["task.name", "seed"]),
+        ("a: &a [1]\nb: *a", []),
+        (None, []),
     ],
 )
-def test_a_configuration_that_cannot_be_read_is_named_with_the_reason(write_run, content, reason):
+def test_a_configuration_that_cannot_be_read_is_named(write_run, content, names):
     folder = write_run("run", score=0.5)
-    (folder / "config.yaml").write_text(content)
-    damaged = read_run(folder)
-    assert isinstance(damaged, Damaged)
+    (folder / "config.yaml").unlink() if content is None else (folder / "config.yaml").write_text(content)
+    (damaged,) = find_runs([folder])[1]
     assert damaged.path == folder
-    assert re.match(reason, damaged.reason), damaged.reason
-
-
-def test_metrics_without_a_configuration_are_named(write_run, tmp_path):
-    folder = write_run("run")
-    (folder / "config.yaml").unlink()
-    assert find_runs([tmp_path]) == ([], [Damaged(folder, "has no config.yaml")])
+    assert all(name in damaged.reason for name in ["config.yaml", *names]), damaged.reason
 
 
 def test_a_run_that_is_to_take_no_steps_is_damaged(write_run):
-    assert read_run(write_run("run", total_frames=0)).reason.startswith("config.yaml has training.total_frames=0")
+    damaged = read_run(write_run("run", total_frames=0))
+    assert isinstance(damaged, Damaged)
+    assert "training.total_frames=0" in damaged.reason
 
 
 def test_hidden_folders_hold_no_runs(write_run, tmp_path):
@@ -168,5 +157,4 @@ def test_hidden_folders_hold_no_runs(write_run, tmp_path):
 @pytest.mark.parametrize("name", ["missing", "empty"])
 def test_a_path_without_a_run_is_an_error(tmp_path, name):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=f"{name} holds no run"):
-        find_runs([tmp_path / name])
+    refused(lambda: find_runs([tmp_path / name]), str(tmp_path / name))

@@ -1,7 +1,6 @@
 """The smallest runs, and what tests compare of them."""
 
 import csv
-import hashlib
 
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.configuration import compose_run
@@ -24,8 +23,3 @@ def rows(folder):
 def final_parts(folder):
     """Return parameters and statistics of a run's last policy."""
     return policies.restore(folder, num_envs=1, seed=0)[1].parts.state_dict()
-
-
-def contents(folder):
-    """Return a digest of every file in a folder and those in it."""
-    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS, Character
@@ -192,12 +193,6 @@ def test_the_user_may_give_torques_and_gains_by_patterns_of_which_the_last_wins(
     assert [(drive.gain, drive.gain_from) for drive in drives.values()] == [(321, "given"), (500, "file")] * 2
 
 
-@pytest.mark.parametrize("option", ["torque", "gain"])
-def test_a_pattern_that_matches_nothing_is_refused(option):
-    with pytest.raises(ValueError, match=rf"--{option} ankle=50 matches no joint: they are right_thigh, right_shin"):
-        adapted(robot(), **{f"{option}s": {"ankle": 50.0}})
-
-
 def test_what_resists_a_joint_is_kept_and_what_is_raised_is_named():
     resisted = 'stiffness="7" springref="10" frictionloss="0.3" damping="4" armature="0.001"'
     body = adapted(robot(knee=resisted, actuators=SERVOS))
@@ -214,14 +209,12 @@ def test_a_joint_without_limits_is_pointed_out():
     model = robot()
     model.jnt_limited[model.joint("right_knee").id] = 0
     drives = adapted(model).drives
-    assert drives["right_shin"].remark == "no limits in the file: 1.57 rad to either side"
+    assert "1.57 rad" in drives["right_shin"].remark
     assert drives["left_shin"].remark == ""
 
 
-def test_ranges_are_kept_and_a_rest_pose_beyond_them_is_refused():
+def test_ranges_are_kept():
     assert adapted(robot()).ranges["right_shin"] == pytest.approx((np.radians(-0.1), np.radians(2)))
-    with pytest.raises(ValueError, match=r"beyond the range in radians of right_knee \(-2.82 to -0.89\), left_knee \("):
-        adapted(robot(bent=f"{np.degrees(-2.82)} {np.degrees(-0.89)}"))
 
 
 POSES = {"a keyframe": ["crouch"], "angles": ["hip=-0.5", "knee=1"], "both": ["crouch", "hip=-0.5"]}
@@ -258,20 +251,6 @@ def test_the_action_zero_is_the_rest_pose(tmp_path, monkeypatch):
     )
 
 
-@pytest.mark.parametrize(
-    ("pose", "message"),
-    [
-        (["kneel"], "--pose kneel is no keyframe of the file: its keyframes are crouch"),
-        (["ankle=1"], "--pose ankle=1 matches no hinge: they are right_hip, right_knee, left_hip, left_knee"),
-        (["knee=bent"], "--pose knee=bent: 'bent' is no angle in radians"),
-        (["knee(=1"], r"--pose knee\(=1: knee\( is no regular expression: missing \)"),
-    ],
-)
-def test_a_pose_that_is_none_is_refused(pose, message):
-    with pytest.raises(ValueError, match=message):
-        adapted(robot(), pose=pose)
-
-
 BALL = '<body name="ball" pos="2 0 1"><freejoint/><geom name="ball_shape" size="0.1"/></body>'
 
 
@@ -283,8 +262,7 @@ def test_the_root_is_the_body_that_carries_most_or_the_one_that_is_named():
     body = adapted(model)
     assert (body.root, body.left_out) == ("trunk", {"body": ["ball"], "shape": ["ball_shape"], "keyframe": ["crouch"]})
     assert adapted(model, root="trunk").root == "trunk"
-    with pytest.raises(ValueError, match="there is no body chest for the root: name one of ball, trunk, right_thigh"):
-        adapted(model, root="chest")
+    refused(lambda: adapted(model, root="chest"), "chest", "trunk")
 
 
 def test_a_root_without_joint_gets_a_free_joint():
@@ -295,24 +273,13 @@ def test_a_root_without_joint_gets_a_free_joint():
 
 def test_a_root_that_lies_on_the_ground_is_refused():
     ant = mujoco.MjModel.from_xml_path(str(ASSETS / "ant.xml"))
-    with pytest.raises(ValueError, match="the rest pose is beyond the range in radians of ankle_1"):
-        adapted(ant)
+    refused(lambda: adapted(ant), "ankle_1")
     ant.jnt_limited[:] = 0
-    with pytest.raises(ValueError, match="torso, the root, is lowest in the rest pose: choose one that stands on feet"):
-        adapted(ant)
+    refused(lambda: adapted(ant), "torso", "--pose", "--feet")
     assert adapted(ant, feet=["torso"]).feet == ("torso",)
     standing = adapted(ant, pose=["ankle_[14]=1", "ankle_[23]=-1"])
     assert standing.feet == ("body_4", "body_7", "body_10", "body_13")
-    with pytest.raises(ValueError, match="there is no body hoof for the feet"):
-        adapted(ant, feet=["hoof"])
-
-
-SLIDE = ROBOT.format(**PLAIN).replace('name="right_knee"', 'type="slide" name="right_knee"')
-
-
-def test_a_slide_joint_is_refused():
-    with pytest.raises(ValueError, match="right_shin has a joint that is neither hinge nor ball: replace or weld it"):
-        adapted(mujoco.MjModel.from_xml_string(SLIDE))
+    refused(lambda: adapted(ant, feet=["hoof"]), "hoof")
 
 
 @pytest.mark.parametrize("size", [1.0, 0.01])
@@ -476,11 +443,6 @@ FIXED_DOG = DOG.format(
 )
 
 
-def test_a_fixed_trunk_that_was_merged_into_the_world_is_recognised():
-    with pytest.raises(ValueError, match=r"fr_leg, fl_leg, hr_leg, hl_leg hang on the world.* pass --floating"):
-        adapted(mujoco.MjSpec.from_string(FIXED_DOG).compile())
-
-
 def test_a_floating_trunk_keeps_all_legs_and_its_mass():
     spec = mujoco.MjSpec.from_string(FIXED_DOG)
     float_trunk(spec)
@@ -493,21 +455,40 @@ def test_a_floating_trunk_keeps_all_legs_and_its_mass():
 
 def test_a_trunk_that_cannot_float_is_named():
     spec = mujoco.MjSpec.from_string(ROBOT.format(**PLAIN))
-    with pytest.raises(ValueError, match="--floating: trunk already has a joint"):
-        float_trunk(spec)
-    with pytest.raises(ValueError, match="--floating: right_shin does not hang on the world"):
-        float_trunk(spec, "right_shin")
+    refused(lambda: float_trunk(spec), "--floating", "trunk")
+    refused(lambda: float_trunk(spec, "right_shin"), "--floating", "right_shin")
 
 
-def test_a_mesh_that_collides_is_named_with_its_body():
-    mesh = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
-    text = ROBOT.format(**PLAIN).replace("<worldbody>", mesh, 1)
-    shin = '<body name="left_shin" pos="0 0 -0.4">'
-    text = text.replace(shin, f'{shin}<geom type="mesh" mesh="m"/>')
-    with pytest.raises(ValueError, match="of the body left_shin is a mjGEOM_MESH"):
-        adapted(mujoco.MjModel.from_xml_string(text))
+BENT = f"{np.degrees(-2.82)} {np.degrees(-0.89)}"
+SHIN = '<body name="left_shin" pos="0 0 -0.4">'
+MESH = [
+    ("<worldbody>", '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'),
+    (SHIN, f'{SHIN}<geom type="mesh" mesh="m"/>'),
+]
 
 
-def test_the_example_of_a_pose_moves_every_joint_that_is_beyond_its_range():
-    with pytest.raises(ValueError, match=r"--pose right_knee=-1.85 left_knee=-1.85"):
-        adapted(robot(bent=f"{np.degrees(-2.82)} {np.degrees(-0.89)}"))
+def changed(*replacements):
+    text = ROBOT.format(**PLAIN)
+    for old, new in replacements:
+        text = text.replace(old, new, 1)
+    return mujoco.MjModel.from_xml_string(text)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "names"),
+    [
+        (robot, {"torques": {"ankle": 50.0}}, ["--torque ankle=50", "right_shin"]),
+        (robot, {"gains": {"ankle": 50.0}}, ["--gain ankle=50", "right_shin"]),
+        (robot, {"pose": ["kneel"]}, ["--pose kneel", "crouch"]),
+        (robot, {"pose": ["ankle=1"]}, ["--pose ankle=1", "right_knee"]),
+        (robot, {"pose": ["knee=bent"]}, ["--pose knee=bent"]),
+        (robot, {"pose": ["knee(=1"]}, ["--pose knee(=1"]),
+        (lambda: robot(bent=BENT), {}, ["--pose right_knee=-1.85 left_knee=-1.85"]),  # beyond its joints' ranges
+        (lambda: changed(*MESH), {}, ["left_shin", "mjGEOM_MESH"]),
+        (lambda: changed(('name="right_knee"', 'type="slide" name="right_knee"')), {}, ["right_shin"]),
+        (lambda: mujoco.MjSpec.from_string(FIXED_DOG).compile(), {}, ["fr_leg", "hl_leg", "--floating"]),
+    ],
+)
+def test_a_body_or_an_option_that_does_not_fit_is_refused(make, options, names):
+    model = make()
+    refused(lambda: adapted(model, **options), *names)

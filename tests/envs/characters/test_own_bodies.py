@@ -5,6 +5,7 @@ from importlib.resources import files
 
 import pytest
 import torch
+from refusals import refused
 
 from torchrl_mcp.envs import Carry, Heading
 from torchrl_mcp.envs.characters import BIPED, CHARACTERS
@@ -67,16 +68,14 @@ def test_frames_that_are_no_mirror_images_are_found_where_mirror_images_are_aske
     body = variant(('<body name="left_knee"', f'<body name="left_knee" euler="0 0 {angle}"'))
     assert any("left_knee" in str(violation) for violation in body.check())
     for images in mirror_images(body):
-        with pytest.raises(ValueError, match=r"frames of .*left_knee.* are no mirror images"):
-            images()
+        refused(images, "left_knee")
 
 
 def test_limbs_whose_sides_are_unknown_have_no_mirror_images(variant, monkeypatch):
     body = variant()
     monkeypatch.setitem(CHARACTERS, body.name, replace(body, sides=()))
     for images in mirror_images(body):
-        with pytest.raises(ValueError, match=r"frames of right_hip, .*left_ankle.* \(sides of the Character\)"):
-            images()
+        refused(images, "right_hip", "left_ankle", "sides")
 
 
 def test_a_joint_that_its_twin_lacks_prevents_mirror_images_alone(variant):
@@ -86,5 +85,4 @@ def test_a_joint_that_its_twin_lacks_prevents_mirror_images_alone(variant):
     body = variant(('<joint name="left_ankle"/>', ""), *servos)
     assert any("the twin of right_ankle has other joints" in str(violation) for violation in body.check())
     for images in mirror_images(body):
-        with pytest.raises(ValueError, match="joints of right_ankle are missing or of other kinds on the other side"):
-            images()
+        refused(images, "right_ankle")

@@ -146,21 +146,3 @@ def test_the_arrow_is_as_long_as_the_way_of_a_second():
     for index, speed in enumerate(speeds.tolist()):
         [(tail, tip)] = env.arrows(index)
         assert (tip - tail).tolist() == pytest.approx([speed * math.cos(0.7), speed * math.sin(0.7), 0.0], abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"max_turn": -0.1}, "max_turn=-0.1 is out of range"),
-        ({"speed": float("nan")}, "speed=nan is out of range"),
-        ({"speed": 0.0}, "speed=0.0 is out of range"),
-        ({"speed": (0.0, 0.0)}, "speed=0.0 is out of range"),
-        ({"speed": (-0.5, 1.0)}, "speed=-0.5 is out of range"),
-        ({"speed": (1.0, 0.5)}, "speed=.*is no interval"),
-        ({"speed_interval": 0.0}, "speed_interval=0.0 is out of range"),
-        ({"initial_directions": (1.0, 0.0)}, "initial_directions=.*is no interval"),
-    ],
-)
-def test_wrong_arguments_are_named_with_a_remedy(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(**arguments)

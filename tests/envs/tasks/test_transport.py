@@ -1,7 +1,5 @@
 """Carrying and dribbling as environments: specs, seeds, resets, states and arguments."""
 
-import math
-
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -117,22 +115,3 @@ def test_positions_and_velocities_alone_are_a_state(task):
     assert torch.equal(state["qpos"], whole["qpos"])
     assert not torch.equal(state["mocap_pos"], whole["mocap_pos"])
     assert torch.equal(state["object"], whole["qpos"][:, -7:-4])
-
-
-@every_task
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"object_distances": (-1.0, 2.0)}, "object_distances=.*begins below 0"),
-        ({"object_distances": (3.0, 2.0)}, "object_distances=.*is no interval"),
-        ({"object_distances": (0.0, 0.3)}, "object_distances=.*where bodies overlap: let it end beyond"),
-        ({"target_distances": (-0.1, 2.0)}, "target_distances=.*begins below 0"),
-        ({"target_distances": (1.0, math.inf)}, "target_distances=.*is no interval"),
-        ({"speed": -1.0}, "speed=-1.0 is out of range"),
-        ({"target_distance_power": 3}, "target_distance_power=3 is out of range"),
-        ({"character": "horse"}, "character='horse' is unknown"),
-    ],
-)
-def test_wrong_arguments_are_named_with_a_remedy(task, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        make(task, **arguments)

@@ -72,11 +72,6 @@ def test_a_thing_at_the_character_is_at_the_origin_of_logarithmic_goals():
     assert torch.equal(logarithmic(torch.zeros(1, 2)), torch.zeros(1, 2))
 
 
-def test_an_unknown_form_of_positions_is_named_with_a_remedy():
-    with pytest.raises(ValueError, match="goal_positions='feet' is unknown: pass metres or logarithmic"):
-        make(Dribble, goal_positions="feet")
-
-
 @every_task
 def test_the_layout_of_the_goal_leaves_nothing_out(task):
     env = make(task, num_envs=1)

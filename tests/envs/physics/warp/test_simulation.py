@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from refusals import refused
 from tensordict import TensorDict
 
 from torchrl_mcp.envs.physics.warp import WarpSimulation, constraint_room, contact_room
@@ -143,7 +144,7 @@ def test_too_little_room_for_constraints_is_a_fault_and_for_contacts_an_error(ma
     assert few.state["time"].tolist() == pytest.approx([model.opt.timestep, 0.0])
     crowded = WarpSimulation(model, 2, device=device, substeps=1, contacts=1, constraints=4)
     crowded.reset(torch.arange(2, device=device), {"qpos": sunk})
-    with pytest.raises(RuntimeError, match="more contacts than the 2 that there is room for"):
+    with pytest.raises(RuntimeError, match="contacts"):
         crowded.step(torch.zeros(2, model.nu, device=device))
 
 
@@ -167,5 +168,4 @@ def test_a_state_that_is_not_finite_is_refused(env):
     state = TensorDict({"qpos": env.simulation.state["qpos"].cpu(), "qvel": torch.full((8, 23), torch.nan)}, [8]).to(
         env.device
     )
-    with pytest.raises(ValueError, match="qvel is not finite"):
-        env.reset(state, set_state=True)
+    refused(lambda: env.reset(state, set_state=True), "qvel")
