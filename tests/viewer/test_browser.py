@@ -17,7 +17,7 @@ from PIL import Image
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-pytest.importorskip("mujoco.experimental.studio", reason="needs MuJoCo Studio as MuJoCo 3.17 has it")
+pytest.importorskip("torchrl_mcp.viewer.studio", reason="needs MuJoCo Studio")
 
 from playwright import sync_api as playwright
 

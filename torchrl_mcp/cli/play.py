@@ -97,13 +97,6 @@ def parser() -> argparse.ArgumentParser:
     )
     viewer.add_argument("--watch", action="store_true", help="for a run in training: play each new checkpoint")
     viewer.add_argument("--port", type=port, default=0, help="port of the page (default: the first free one from 8080)")
-    viewer.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address that the page is served at (default %(default)s, for this machine alone). With another, such as "
-        "0.0.0.0, everybody who can reach the port sees the simulation, its model and the viewer's log with paths of "
-        "files, without a password; control and uploads stay with this machine",
-    )
     return parser
 
 

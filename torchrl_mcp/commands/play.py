@@ -66,10 +66,8 @@ def show(
             try:
                 from torchrl_mcp.viewer.web import play_in_browser  # slow to import, like the window
             except ImportError as error:
-                raise RuntimeError(f"Studio is not where mujoco 3.17 has it, install that: {error}") from error
-            play_in_browser(
-                Player(policy, env, before_step=before_step, **look), port=arguments.port, host=arguments.host
-            )
+                raise RuntimeError(f"there is no MuJoCo Studio, install mujoco 3.17 or 4.0: {error}") from error
+            play_in_browser(Player(policy, env, before_step=before_step, **look), port=arguments.port)
         case "window":
             from torchrl_mcp.viewer.window import play_in_window
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from mujoco.experimental.dear_imgui import dear_imgui as imgui
-from mujoco.experimental.studio import ux, viewer_protocol
+
+from torchrl_mcp.viewer.studio import imgui, ux, viewer_protocol
 
 SLACK = 5.0
 """Largest movement of the mouse during a click, in pixels."""

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from functools import partial
 
-from mujoco.experimental.dear_imgui import dear_imgui as imgui
 from PIL import ImageColor
 
 from torchrl_mcp.analysis.figures import colours
 from torchrl_mcp.viewer.player import Weights
 from torchrl_mcp.viewer.steering import Steering
+from torchrl_mcp.viewer.studio import imgui
 
 Command = Callable[[Steering], None]
 """A user's command to the steering."""

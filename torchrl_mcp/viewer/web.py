@@ -4,17 +4,26 @@ import time
 from dataclasses import dataclass
 
 import mujoco
-from mujoco.experimental.dear_imgui import dear_imgui as imgui
-from mujoco.experimental.studio import launch_web, messages, plugin, sim, ux, viewer_app, viewer_protocol
 
 from torchrl_mcp.envs.rendering.camera import Shape
 from torchrl_mcp.viewer.film import AZIMUTH, DISTANCE, ELEVATION
-from torchrl_mcp.viewer.guard import HERE, guarded
+from torchrl_mcp.viewer.guard import guarded
 from torchrl_mcp.viewer.mouse import Mouse
 from torchrl_mcp.viewer.panel import Command, draw
 from torchrl_mcp.viewer.player import Player, Weights
 from torchrl_mcp.viewer.scenery import softly_lit
 from torchrl_mcp.viewer.steering import SLOWEST, TURN, Steering
+from torchrl_mcp.viewer.studio import (
+    App,
+    Config,
+    imgui,
+    launch_web,
+    messages,
+    plugin,
+    sim,
+    ux,
+    viewer_protocol,
+)
 
 FURTHER = 1.4
 """Factor on the camera's distance in films: a notice of Studio covers the upper part of the page."""
@@ -42,7 +51,7 @@ class BrowserEvent(messages.Event):
     command: Command
 
 
-class StudioApp(viewer_app.ViewerApp):
+class StudioApp(App):
     """MuJoCo Studio's interface with the panel, and a camera that follows the character.
 
     Attributes:
@@ -61,7 +70,7 @@ class StudioApp(viewer_app.ViewerApp):
         self.weights: Weights | None = None
         self._steering, self._distance = steering, distance
         self._mouse = Mouse(lambda place: self._send(lambda steering: steering.put(place)))
-        super().__init__(viewer_app.ViewerAppConfig(show_options=False, show_inspector=False))
+        super().__init__(Config(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
         """Follow the first body below the world, once there is one."""
@@ -145,20 +154,19 @@ def as_geom(shape: Shape) -> mujoco.MjvGeom:
     return geom
 
 
-def play_in_browser(player: Player, *, port: int, host: str = HERE) -> None:
+def play_in_browser(player: Player, *, port: int) -> None:
     """Play until the viewer is closed, at the speed of its controls.
 
     Args:
         player: The player to show.
         port: Port of the page, 0 for the first free one from 8080.
-        host: Address of the interface to listen on; other machines can watch, but not control.
     """
     steering, pace = Steering(player), Pace()
     app = StudioApp(steering, distance=FURTHER * DISTANCE * player.extent)
     model = softly_lit(player.env.simulation.model, horizon=HORIZON, zenith=ZENITH)
     data = mujoco.MjData(model)
     config = viewer_protocol.ViewerConfig(title="torchrl-mcp-play", http_port=port, open_browser=True)
-    with guarded(host), launch_web.launch(config, plugins=[app, pace, BrowserInput(steering)]) as viewer:
+    with guarded(), launch_web.launch(config, plugins=[app, pace, BrowserInput(steering)]) as viewer:
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / max(pace.speed, SLOWEST)
             if not pace.paused:
