@@ -1,7 +1,8 @@
 """MuJoCo Studio, which MuJoCo 4 has as ``mujoco.studio`` and MuJoCo 3.17 has among its experiments."""
 
 try:
-    from mujoco.studio import App, Config, launch_web, messages, plugin, sim, ux, viewer_protocol, web_viewer
+    from mujoco.studio import launch_web, messages, plugin, sim, ux, viewer_protocol, web_viewer
+    from mujoco.studio.app import App, Config
     from mujoco.studio.dear_imgui import dear_imgui as imgui
     from mujoco.studio.web import web_server
 except ModuleNotFoundError:
