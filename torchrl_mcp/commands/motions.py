@@ -75,7 +75,7 @@ Failures = dict[Path, Exception]
 SLIDING = 0.2
 """Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
 
-GLIDING = 0.5
+GLIDING = 0.7
 """The same for the slowest of the lowest points of the body."""
 
 CAUSES = "unit, frame rate, map or order of rotations"

@@ -20,6 +20,12 @@ SWINGING = 1.0
 RUNNING = 2.0
 """Speed in m/s above which people run; both feet of a runner are in the air when they pass each other."""
 
+SPINNING = 3.0
+"""Rate of turning in rad/s above which a foot pivots or slips; people who walk turn more slowly."""
+
+STEPS, LOOPED_STEPS = 3, 2
+"""Fewest steps of a walk, and of one cycle of a walk."""
+
 NEAR = 0.05
 """Height in metres of a sole above or below the ground up to which the foot should stand."""
 
@@ -65,7 +71,8 @@ def foot_slide(clip: MotionClip) -> float:
     """Median horizontal speed of a foot while the other one swings past it, in m/s; NaN without walking on two feet.
 
     At that moment the foot should stand. If the rotations of a recording are read in the wrong order, it slides at 0.2
-    to 1 m/s. Moments in which no foot is on the ground, as in jumps, rolls, cartwheels and crawls, are left out.
+    to 1 m/s. Moments without a foot on the ground, as in jumps, rolls, cartwheels and crawls, and in which the body
+    runs or spins, are left out.
     """
     names, bodies = body_names(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet[:2]]
@@ -74,13 +81,14 @@ def foot_slide(clip: MotionClip) -> float:
     velocities, places = bodies.linear_velocities[..., :2], bodies.positions[..., :2]
     first, second = feet
     swinging = (velocities[:, first] - velocities[:, second]).norm(dim=-1) > SWINGING
-    walking = swinging & (velocities[:, 0].norm(dim=-1) < RUNNING)
+    turning = bodies.angular_velocities[:, 0, 2].abs()
+    walking = swinging & (velocities[:, 0].norm(dim=-1) < RUNNING) & (turning < SPINNING)
     apart = (places[:, first] - places[:, second]).norm(dim=-1)
     passing = (apart[1:-1] < apart[:-2]) & (apart[1:-1] <= apart[2:]) & walking[1:-1]
     speed, slower = velocities[:, feet].norm(dim=-1).min(-1)
     on_ground = _on_ground(clip).gather(1, slower.unsqueeze(-1)).squeeze(-1)
     slides = speed[1:-1][passing & on_ground[1:-1]]
-    return float(slides.quantile(0.5)) if len(slides) else math.nan
+    return float(slides.quantile(0.5)) if len(slides) >= (LOOPED_STEPS if clip.loop else STEPS) else math.nan
 
 
 def gliding(clip: MotionClip) -> float:
