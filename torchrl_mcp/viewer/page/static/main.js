@@ -27,7 +27,7 @@ class Page {
     this.addButtons();
     this.addPointer();
     addEventListener("keydown", (event) => this.press(event));
-    document.addEventListener("visibilitychange", () => (this.owed = 0));
+    document.addEventListener("visibilitychange", () => (this.last = performance.now())); // what was hidden is not due
     new ResizeObserver(([{ contentRect }]) => {
       this.drawing.resize(Math.max(contentRect.width, 1), Math.max(contentRect.height, 1));
     }).observe(element("stage"));

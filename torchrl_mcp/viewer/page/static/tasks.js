@@ -202,18 +202,26 @@ export class Carry extends Transport {
     this.data.mocap_quat.set(turn, 4 * this.mocap("source"));
     this.data.qpos.set([x, y, this.source_height + HALF_SIZE, ...turn], this.model.nq - 7);
     this.data.qvel.fill(0, this.model.nv - 6);
-    this.data.eq_active[this.joint] = 0;
+    this.fix(false);
     this.taken = false;
+  }
+
+  /** Fix the box to the carrier, or let it go. JavaScript cannot write eq_active itself. */
+  fix(held) {
+    const { mujoco, model, data } = this;
+    const part = mujoco.mjtState.mjSTATE_EQ_ACTIVE.value;
+    const active = new mujoco.DoubleBuffer(model.neq);
+    mujoco.mj_getState(model, data, active, part);
+    active.GetView()[this.joint] = Number(held);
+    mujoco.mj_setState(model, data, Array.from(active.GetView()), part);
+    active.delete();
+    this.held = held;
   }
 
   /** A box that was let go is lifted onto the source where it lies, and then brought to the place. */
   put(place) {
     if (this.taken && !this.held) this.offer(this.place("box"), heading(quaternion(this.data.xquat, this.object)));
     super.put(place);
-  }
-
-  get held() {
-    return this.data.eq_active[this.joint] === 1;
   }
 
   waypoint() {
@@ -224,10 +232,10 @@ export class Carry extends Transport {
   after_step() {
     const touching = !this.taken && this.data.sensordata.some((gap) => gap <= 0);
     if (this.held && this.over("target", CLEARANCE + RESTING_GAP)) {
-      this.data.eq_active[this.joint] = 0;
+      this.fix(false);
     } else if (touching && this.over("source", RESTING_GAP)) {
       this.model.eq_data.set(this.relative_pose(), 11 * this.joint + 3);
-      this.data.eq_active[this.joint] = 1;
+      this.fix(true);
       this.data.mocap_pos[3 * this.mocap("source") + 2] -= CLEARANCE;
       this.taken = true;
     }
