@@ -180,3 +180,92 @@ def test_the_humanoid_of_a_page_stands_at_as_many_places_as_published(simulated)
     places = torch.stack([distances * angles.cos(), distances * angles.sin()], -1)
     reached = simulated(WALKED, places.tolist(), "humanoid-location", half=True)
     require_share(np.array(reached), 0.95)
+
+
+@pytest.fixture
+def visit(browser, serve, written):
+    """Open the page of networks at a size, and wait until it runs."""
+    tabs = []
+
+    def open_page(*names, width=390, height=844, script=""):
+        tabs.append(tab := browser.new_page(viewport={"width": width, "height": height}, has_touch=True))
+        tab.set_default_timeout(PATIENCE)
+        tab.add_init_script(script)
+        address = serve(written(*names, half=True))
+        tab.requested = []
+        tab.on("request", lambda request: tab.requested.append(request.url.removeprefix(address)))
+        tab.goto(address)
+        return tab
+
+    yield open_page
+    for tab in tabs:
+        tab.close()
+
+
+def test_a_reader_steers_holds_gates_pushes_and_changes_the_gate_on_a_telephone(visit):
+    tab = visit("humanoid-location", "humanoid-heading")
+    tab.wait_for_selector("body.ready")
+    tab.wait_for_function("page.simulation.time > 0.5")
+    assert all(path.startswith(("/", "data:", "blob:")) for path in tab.requested)  # nothing from another place
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+
+    before = tab.evaluate("page.task.target")
+    tab.touchscreen.tap(40, 400)  # the ground in front
+    tab.wait_for_function("before => page.task.target.join() !== before.join()", arg=before)
+    tab.tap("#stop")
+    assert tab.evaluate("page.task.speed") == 0.0
+    direction = tab.evaluate("page.task.direction")
+    tab.keyboard.press("ArrowLeft")
+    assert tab.evaluate("page.task.direction") == pytest.approx(direction + math.radians(15))
+    tab.keyboard.press("ArrowUp")
+    assert tab.evaluate("page.task.speed") == pytest.approx(0.25)
+
+    bar = tab.locator("#bars input").nth(2)
+    box = bar.bounding_box()
+    tab.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+    tab.mouse.down()
+    tab.wait_for_function("Math.abs(page.simulation.weights[2] - 0.25) < 0.05")
+    tab.mouse.up()
+    bar.focus()
+    tab.keyboard.press("End")
+    tab.wait_for_function("page.simulation.weights[2] === 1")
+    tab.tap("#release")
+    assert tab.evaluate("page.simulation.pinned.size") == 0
+
+    tab.tap("#pause")
+    tab.tap("#push")
+    tab.wait_for_function("document.getElementById('status').textContent.includes('paused')")
+    place = tab.evaluate("page.task.com")
+    tab.evaluate("async () => { for (let step = 0; step < 18; step++) await page.simulation.advance(); }")
+    assert tab.evaluate("Math.hypot(...page.simulation.scene.data.xfrc_applied.subarray(6, 8))") > 10.0
+
+    tab.click("#gates button >> nth=1")
+    assert tab.evaluate("page.simulation.scene.gate.task") == "Heading"
+    assert np.abs(np.subtract(tab.evaluate("page.task.com"), place)).max() < 1.0  # it goes on where it was
+    tab.keyboard.press("Backspace")
+    assert np.abs(tab.evaluate("page.task.com.slice(0, 2)")).max() < 0.2
+    tab.click("#slow")
+    assert tab.evaluate("page.pace") == 1
+
+
+SLOWER = """() => {
+  const act = page.simulation.act;
+  page.simulation.act = function (...seen) {
+    for (const end = performance.now() + 40; performance.now() < end; );
+    return act.apply(this, seen);
+  };
+}"""
+
+
+def test_a_page_says_that_it_does_not_keep_real_time(visit):
+    tab = visit("humanoid-location")
+    tab.wait_for_selector("body.ready")
+    tab.evaluate(SLOWER)
+    slow = "/0\\.\\d+ × real time: this device is too slow/"
+    tab.wait_for_function(f"{slow}.test(document.getElementById('status').textContent)")
+
+
+def test_a_browser_without_simd_gets_a_sentence_and_fetches_nothing_large(visit):
+    tab = visit("humanoid-location", script="WebAssembly.validate = () => false;")
+    tab.wait_for_function("document.getElementById('message').textContent.includes('WebAssembly SIMD')")
+    assert not [path for path in tab.requested if "wasm" in path or "onnx" in path]

@@ -219,8 +219,8 @@ function sun() {
 
 function arrow() {
   const paint = new three.MeshLambertMaterial({ color: RED });
-  const shaft = new three.CylinderGeometry(0.04, 0.04, 1, 20).rotateX(Math.PI / 2).translate(0, 0, 0.5);
-  const tip = new three.ConeGeometry(0.1, 0.2, 24).rotateX(Math.PI / 2).translate(0, 0, -0.1);
+  const shaft = new three.CylinderGeometry(0.03, 0.03, 1, 20).rotateX(Math.PI / 2).translate(0, 0, 0.5);
+  const tip = new three.ConeGeometry(0.08, 0.2, 24).rotateX(Math.PI / 2).translate(0, 0, -0.1);
   const shape = new three.Group().add(new three.Mesh(shaft, paint), new three.Mesh(tip, paint));
   shape.children.forEach((part) => (part.castShadow = true));
   return shape;

@@ -8,7 +8,7 @@ const SPEEDS = [1, 0.5, 0.2]; // of time
 const [PUSH_SECONDS, PUSH_SPEED] = [0.15, 0.5]; // a push adds so many m/s to the whole body
 const [SLACK, DEBT, FALLEN_SECONDS] = [6, 0.1, 2]; // pixels of a click; seconds to catch up; until the next episode
 
-const LEAST_PICTURES = 20; // per second: below, pictures become simpler
+const LEAST_PICTURES = 20; // per second: below, after two seconds, pictures become simpler
 
 const element = (id) => document.getElementById(id);
 
@@ -18,6 +18,7 @@ class Page {
   paused = false;
   pushed = 0; // seconds of a push that are left
   lying = 0; // seconds since a fall
+  few = 0; // times in a row that pictures were few
   pictures = { since: performance.now(), count: 0, simulated: 0, wanted: 0 };
 
   constructor(simulation) {
@@ -78,7 +79,8 @@ class Page {
     const time = this.paused ? "paused" : pace > 0.93 ? "real time" : `${pace.toFixed(2)} × real time`;
     const reason = this.simulation.fallen ? ": fallen, stands up soon" : !this.paused && slow ? ": this device is too slow" : "";
     element("status").textContent = `${Math.round(pictures.count / seconds)} frames/s · ${time}${reason}`;
-    if (pictures.count / seconds < LEAST_PICTURES && seconds < 5) this.drawing.lighten();
+    this.few = pictures.count / seconds < LEAST_PICTURES ? this.few + 1 : 0;
+    if (this.few === 4) this.drawing.lighten();
     this.pictures = { since: now, count: 0, simulated: 0, wanted: 0 };
   }
 
