@@ -18,6 +18,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchrl_mcp import __version__, analysis
+from torchrl_mcp.commands import export
 from torchrl_mcp.commands.demo_page import write_page
 from torchrl_mcp.runs import configuration, experiment, records
 from torchrl_mcp.runs.policies import restore
@@ -47,11 +48,13 @@ RECENT = 10
 """Iterations whose returns are averaged in the line of progress."""
 
 FILM = "film.gif"
+PAGE = "page"
 CONTENTS = {
     "index.html": "all of it on one page",
     "results.md, results.json": "the table, and its numbers",
     "learning_curves.png, .svg, .csv": "both curves",
     FILM: "both side by side, under the same arrow",
+    PAGE: "web page: the gate in any browser, with nothing installed there",
     "mcp/, scratch/": "run folders, for every other command",
 }
 
@@ -75,19 +78,22 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
     show_progress([start(learn, core) for core in cores], runs)
     rows = results(runs)
     print("\n" + report(folder, runs, rows))
-    filmed = film(folder, runs)
+    made = {FILM: film(folder, runs), PAGE: page(folder)}
     write_page(
         folder,
         table_rows(rows),
         caption=caption(runs, rows),
-        film=FILM if filmed else None,
+        film=FILM if made[FILM] else None,
         curves="learning_curves.svg",
         commands=commands(folder, runs),
     )
     print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes, in {folder}:")
     for name, content in CONTENTS.items():
-        if filmed or name != FILM:
+        if made.get(name, True):
             print(f"  {name:35}{content}")
+    if made[PAGE]:
+        served = shlex.join(["python", "-m", "http.server", "--directory", str(folder / PAGE)])
+        print(f"open the page at http://localhost:8000 after\n    {served}")
     print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder, runs).items()), sep="\n")
 
 
@@ -265,6 +271,22 @@ def film(folder: Path, runs: Runs) -> bool:
         save_films(players, path, seconds=seconds, width=320, height=240)
     except RuntimeError as error:
         print(f"no film: {error}")
+        return False
+    return True
+
+
+def page(folder: Path) -> bool:
+    """Write a web page of the gate, unless there is one; return whether there is one.
+
+    It needs npm, and ONNX for Python.
+    """
+    if (folder / PAGE / "page.json").exists():
+        return True
+    words = ["torchrl-mcp-export", str(folder / "mcp"), "--page", str(folder / PAGE)]
+    try:
+        export.page([folder / "mcp"], folder / PAGE, words=words)
+    except ValueError as error:
+        print(f"no web page: {error}")
         return False
     return True
 

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_mcp.runs import policies
+from torchrl_mcp.runs import builtin, policies
 from torchrl_mcp.viewer.page.folder import write_page
 
 
@@ -22,8 +22,8 @@ def page(checkpoints: Sequence[Path], folder: Path, *, words: Sequence[str]) -> 
     players = {}
     for path in checkpoints:
         cfg, agent, env = policies.restore(path, num_envs=1, seed=0)
-        name = cfg.task.name
-        players[name if name not in players else path.stem] = agent.actor.policy, env
+        name = path.stem.rpartition("-")[2] if path.parent == builtin.FOLDER else cfg.task.name
+        players[name if name not in players else f"{name} {len(players) + 1}"] = agent.actor.policy, env
     title = f"{cfg.character.name}: {' or '.join(players)}"
     write_page(players, folder, title=title, command=shlex.join(words))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -1,5 +1,6 @@
 """ONNX files of exported programs."""
 
+import logging
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,6 +39,7 @@ def write_program(
     """
     import onnx
 
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of operators of packages that are not needed
     with replacing(path) as partial, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's exporter warns about itself
         torch.onnx.export(

@@ -78,7 +78,7 @@ def _fetch(folder: Path) -> Path:
     for name in ("package.json", "package-lock.json"):
         with as_file(resources(__package__) / name) as path:
             shutil.copy(path, folder)
-    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"]
+    command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error", "--fetch-retries=1"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if done.returncode:
         reason = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")

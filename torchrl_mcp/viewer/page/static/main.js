@@ -102,10 +102,8 @@ class Page {
     }
     [...element("gates").children].forEach((button, other) => button.setAttribute("aria-pressed", other === index));
     element("pad").hidden = !this.task.steers;
-    const { gate } = this.simulation.scene;
-    const changes = gate.speeds && gate.speeds[0] < gate.speeds[1];
-    for (const id of ["faster", "slower", "stop"]) element(id).hidden = !changes;
-    element("help").textContent = HELP[gate.task];
+    for (const id of ["faster", "slower", "stop"]) element(id).hidden = !this.task.paces;
+    element("help").textContent = HELP[this.simulation.scene.gate.task];
   }
 
   /** A bar for each primitive, once their number is known. */
@@ -157,7 +155,7 @@ class Page {
       ArrowRight: actions.right,
       ArrowUp: actions.faster,
       ArrowDown: actions.slower,
-      " ": () => (this.task.steers ? actions.stop() : actions.pause()),
+      " ": () => (this.task.paces ? actions.stop() : actions.pause()),
       Enter: actions.release,
       Backspace: actions.reset,
       "-": () => this.slow(1),
@@ -215,7 +213,7 @@ class Page {
 }
 
 const HELP = {
-  Heading: "Click the ground, or press ← →, to turn; ↑ ↓ change the speed where the gate has one.",
+  Heading: "Click the ground, or press ← and →: the character turns there. ↑ and ↓ change the speed if the gate knows others.",
   Location: "Click the ground: the character goes there. Or lead it with ← → ↑ ↓; Space stops it.",
   Carry: "Click the ground: the red table moves there, and the character brings the box.",
   Dribble: "Click the ground: the target moves there, and the character brings the ball.",

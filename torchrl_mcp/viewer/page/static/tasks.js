@@ -13,8 +13,7 @@ const [HALF_SIZE, TOP_HALF_SIZE, CLEARANCE, RESTING_GAP] = [0.15, 0.14, 0.1, 0.0
 const between = (low, high) => low + (high - low) * Math.random();
 
 class Task {
-  steers = false; // whether arrow keys turn the target and change its speed
-  places = true; // whether the target is a place
+  steers = false; // whether arrow keys turn the target
 
   constructor({ mujoco, model, data, gate }) {
     Object.assign(this, { mujoco, model, data, gate });
@@ -26,6 +25,11 @@ class Task {
 
   get heading() {
     return heading(quaternion(this.data.xquat, 1));
+  }
+
+  /** Whether the target has other speeds. */
+  get paces() {
+    return this.steers && this.gate.speeds[0] < this.gate.speeds[1];
   }
 
   /** A place at a distance, in a direction from the character's heading. */
@@ -66,8 +70,6 @@ class Steered extends Task {
 }
 
 export class Heading extends Steered {
-  places = false;
-
   begin() {
     const [low, high] = this.gate.speeds;
     this.lead(this.heading, Math.min(Math.max(1, low), high));
