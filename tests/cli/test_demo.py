@@ -167,22 +167,21 @@ def test_a_curve_begins_after_the_pre_training_of_the_same_demonstration(finishe
     assert list(demo.commands(tmp_path, both)) == ["steer it in the browser"]
 
 
-def test_it_ends_with_a_web_page_of_the_gate_or_says_why_there_is_none(finished):
+def test_it_ends_with_a_web_page_of_the_gate(finished):
     page = finished.folder / demo.PAGE / "page.json"
     if not page.exists():
-        assert "no web page" in finished.output
-        pytest.skip("no npm")
+        pytest.skip("no npm, or no connection")
     (gate,) = json.loads(page.read_text())["gates"]
     assert gate["task"] == "Heading"
     assert shlex.join(["--directory", str(page.parent)]) in finished.output
 
 
-def test_without_npm_the_demonstration_says_so_and_ends_well(finished, tmp_path, monkeypatch, capsys):
+def test_without_npm_the_demonstration_gives_the_reason_and_writes_no_page(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "PAGE", "another page")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert not demo.page(finished.folder)
-    assert capsys.readouterr().out.startswith("no web page: ")
+    demo.page(finished.folder)
+    assert "npm" in capsys.readouterr().out
     assert not (finished.folder / "another page").exists()
 
 

@@ -20,13 +20,14 @@ from omegaconf import DictConfig
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.commands import export
 from torchrl_mcp.commands.demo_page import write_page
-from torchrl_mcp.runs import configuration, experiment, records
+from torchrl_mcp.runs import configuration, experiment, processes, records
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics, replacing, write_json
 from torchrl_mcp.viewer.film import save_films
+from torchrl_mcp.viewer.page.folder import ABOUT
 from torchrl_mcp.viewer.player import Player
 
 Runs = Mapping[str, DictConfig]
@@ -76,9 +77,12 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
     print(introduction(runs, folder), flush=True)
     cores = [[cfg for name, cfg in runs.items() if name != "scratch"], [runs["scratch"]]]
     show_progress([start(learn, core) for core in cores], runs)
+    page_writer = processes.start(page, folder)  # on the other core, beside the film
     rows = results(runs)
     print("\n" + report(folder, runs, rows))
-    made = {FILM: film(folder, runs), PAGE: page(folder)}
+    made = {FILM: film(folder, runs)}
+    page_writer.join()
+    made[PAGE] = (folder / PAGE / ABOUT).exists()
     write_page(
         folder,
         table_rows(rows),
@@ -275,20 +279,18 @@ def film(folder: Path, runs: Runs) -> bool:
     return True
 
 
-def page(folder: Path) -> bool:
-    """Write a web page of the gate, unless there is one; return whether there is one.
+def page(folder: Path) -> None:
+    """Write a web page of the gate, unless there is one.
 
-    It needs npm, and ONNX for Python.
+    It needs npm, and ONNX for Python; without them it prints the reason.
     """
-    if (folder / PAGE / "page.json").exists():
-        return True
+    if (folder / PAGE / ABOUT).exists():
+        return
     words = ["torchrl-mcp-export", str(folder / "mcp"), "--page", str(folder / PAGE)]
     try:
         export.page([folder / "mcp"], folder / PAGE, words=words)
     except ValueError as error:
-        print(f"no web page: {error}")
-        return False
-    return True
+        print(f"no web page: {error}", flush=True)
 
 
 def commands(folder: Path, runs: Runs) -> dict[str, str]:

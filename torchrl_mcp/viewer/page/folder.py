@@ -17,6 +17,9 @@ from torchrl_mcp.viewer.page.networks import require_same_primitives, stages, wr
 from torchrl_mcp.viewer.page.runtimes import NOTICES, runtimes
 from torchrl_mcp.viewer.page.scene import for_browser, require_same_model
 
+ABOUT = "page.json"
+"""File that describes the policy to JavaScript; it is written last."""
+
 Player = tuple[TensorDictModuleBase, CharacterEnv | TransformedCharacterEnv]
 """A policy and its environment."""
 
@@ -58,7 +61,7 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
         files_ = {"scene": f"scene-{index}.xml", "network": f"gate-{index}.onnx"}
         gates.append({"name": name, **files_, **description.gate(env)})
     about = {"title": title, "command": command, **description.character(envs[0]), "gates": gates}
-    write_json(about, folder / "page.json")
+    write_json(about, folder / ABOUT)
 
 
 def _copy(libraries: Path, folder: Path) -> None:
