@@ -16,6 +16,7 @@ extensions = [
     "commands",
     "docstrings",
     "local_names",
+    "pages",
     "repository_links",
     "myst_parser",
     "sphinx.ext.autodoc",

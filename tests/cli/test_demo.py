@@ -167,6 +167,24 @@ def test_a_curve_begins_after_the_pre_training_of_the_same_demonstration(finishe
     assert list(demo.commands(tmp_path, both)) == ["steer it in the browser"]
 
 
+def test_it_ends_with_a_web_page_of_the_gate(finished):
+    page = finished.folder / demo.PAGE / "page.json"
+    if not page.exists():
+        pytest.skip("no npm, or no connection")
+    (gate,) = json.loads(page.read_text())["gates"]
+    assert gate["task"] == "Heading"
+    assert shlex.join(["--directory", str(page.parent)]) in finished.output
+
+
+def test_without_npm_the_demonstration_gives_the_reason_and_writes_no_page(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "PAGE", "another page")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    demo.page(finished.folder)
+    assert "npm" in capsys.readouterr().out
+    assert not (finished.folder / "another page").exists()
+
+
 def test_an_existing_folder_with_other_settings_is_refused(finished):
     with pytest.raises(ValueError, match=r"holds a run that differs in .*seed.*: give another --output"):
         demo.configure(finished.folder, ["seed=1"], pretrain=False, **SMOKE)

@@ -59,4 +59,4 @@ def test_a_policy_that_remembers_is_refused_by_what_it_reads():
 def test_something_to_write_is_asked_for(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         call(monkeypatch, "builtin:biped")
-    assert "--onnx FILE, --torch FILE, or both" in capsys.readouterr().err
+    assert "--onnx FILE, --torch FILE or --page DIR" in capsys.readouterr().err

@@ -1,6 +1,7 @@
-"""``torchrl-mcp-export``: a trained policy for other programs, as ONNX or for ``torch.export.load``."""
+"""``torchrl-mcp-export``: a trained policy for other programs, as ONNX, for ``torch.export.load``, or as a web page."""
 
 import argparse
+import sys
 from pathlib import Path
 
 from torchrl_mcp.cli.parsing import add_trust, explained, new_parser
@@ -10,26 +11,37 @@ from torchrl_mcp.runs.builtin import locate
 PROGRAM = "torchrl-mcp-export"
 
 EXAMPLES = f"""\
-The program takes the environment's observation and goal, and returns the deterministic action.
+ONNX and torch's program take the environment's observation and goal, and return the deterministic action. A page runs
+physics and networks in the browser of whoever opens it, from any web server.
 
 examples:
   {PROGRAM} builtin:humanoid --onnx humanoid.onnx   # needs pip install 'torchrl-mcp[onnx]'
   {PROGRAM} runs/my-run --torch my-run.pt2          # needs torch alone
+  {PROGRAM} builtin:humanoid-location --gate builtin:humanoid-heading --page humanoid   # needs npm and onnx
 """
 
 
 @explained(PROGRAM)
 def main() -> None:
-    """Write the policy, and print its difference from torch."""
+    """Write the policy, and print its difference from torch, or the page's size."""
     options = parser()
     arguments = options.parse_args()
-    if arguments.onnx is None and arguments.torch is None:
-        options.error("say what to write: --onnx FILE, --torch FILE, or both")
+    if arguments.onnx is None and arguments.torch is None and arguments.page is None:
+        options.error("say what to write: --onnx FILE, --torch FILE or --page DIR")
+    if arguments.gate and arguments.page is None:
+        options.error("--gate adds a gate to a page: say --page DIR too")
     path = locate(arguments.checkpoint)
+    gates = [locate(gate) for gate in arguments.gate]
     announce(PROGRAM)
+    from torchrl_mcp.commands.export import page
     from torchrl_mcp.runs import export
     from torchrl_mcp.runs.trust import trusting
 
+    if arguments.page:
+        with trusting(arguments.trust):
+            print(page([path, *gates], arguments.page, words=[PROGRAM, *sys.argv[1:]]))
+    if arguments.onnx is None and arguments.torch is None:
+        return
     with trusting(arguments.trust):
         policy, states, metadata = export.example(path)
     if arguments.torch:
@@ -52,6 +64,14 @@ def parser() -> argparse.ArgumentParser:
     add_trust(parser)
     parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")
     parser.add_argument("--torch", type=Path, metavar="FILE", help="write a program for torch.export.load")
+    parser.add_argument("--page", type=Path, metavar="DIR", help="write a folder with a web page")
+    parser.add_argument(
+        "--gate",
+        action="append",
+        default=[],
+        metavar="CHECKPOINT",
+        help="another gate over the same primitives, to which the page can switch; repeatable",
+    )
     return parser
 
 

@@ -18,14 +18,16 @@ from typing import Any
 from omegaconf import DictConfig
 
 from torchrl_mcp import __version__, analysis
+from torchrl_mcp.commands import export
 from torchrl_mcp.commands.demo_page import write_page
-from torchrl_mcp.runs import configuration, experiment, records
+from torchrl_mcp.runs import configuration, experiment, processes, records
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics, replacing, write_json
 from torchrl_mcp.viewer.film import save_films
+from torchrl_mcp.viewer.page.folder import ABOUT
 from torchrl_mcp.viewer.player import Player
 
 Runs = Mapping[str, DictConfig]
@@ -47,11 +49,13 @@ RECENT = 10
 """Iterations whose returns are averaged in the line of progress."""
 
 FILM = "film.gif"
+PAGE = "page"
 CONTENTS = {
     "index.html": "all of it on one page",
     "results.md, results.json": "the table, and its numbers",
     "learning_curves.png, .svg, .csv": "both curves",
     FILM: "both side by side, under the same arrow",
+    PAGE: "web page: the gate in any browser, with nothing installed there",
     "mcp/, scratch/": "run folders, for every other command",
 }
 
@@ -73,21 +77,27 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
     print(introduction(runs, folder), flush=True)
     cores = [[cfg for name, cfg in runs.items() if name != "scratch"], [runs["scratch"]]]
     show_progress([start(learn, core) for core in cores], runs)
+    page_writer = processes.start(page, folder)  # on the other core, beside the film
     rows = results(runs)
     print("\n" + report(folder, runs, rows))
-    filmed = film(folder, runs)
+    made = {FILM: film(folder, runs)}
+    page_writer.join()
+    made[PAGE] = (folder / PAGE / ABOUT).exists()
     write_page(
         folder,
         table_rows(rows),
         caption=caption(runs, rows),
-        film=FILM if filmed else None,
+        film=FILM if made[FILM] else None,
         curves="learning_curves.svg",
         commands=commands(folder, runs),
     )
     print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes, in {folder}:")
     for name, content in CONTENTS.items():
-        if filmed or name != FILM:
+        if made.get(name, True):
             print(f"  {name:35}{content}")
+    if made[PAGE]:
+        served = shlex.join(["python", "-m", "http.server", "--directory", str(folder / PAGE)])
+        print(f"open the page at http://localhost:8000 after\n    {served}")
     print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder, runs).items()), sep="\n")
 
 
@@ -267,6 +277,20 @@ def film(folder: Path, runs: Runs) -> bool:
         print(f"no film: {error}")
         return False
     return True
+
+
+def page(folder: Path) -> None:
+    """Write a web page of the gate, unless there is one.
+
+    It needs npm, and ONNX for Python; without them it prints the reason.
+    """
+    if (folder / PAGE / ABOUT).exists():
+        return
+    words = ["torchrl-mcp-export", str(folder / "mcp"), "--page", str(folder / PAGE)]
+    try:
+        export.page([folder / "mcp"], folder / PAGE, words=words)
+    except ValueError as error:
+        print(f"no web page: {error}", flush=True)
 
 
 def commands(folder: Path, runs: Runs) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """Deterministic policies for other programs: ONNX, and ``torch.export``."""
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.interface import interface
+from torchrl_mcp.runs.onnx_files import require_onnx, write_program
 from torchrl_mcp.training.run_folder import replacing
 
 INPUTS = ("observation", "goal")
@@ -103,25 +103,15 @@ def write_onnx(
     Raises:
         ValueError: If onnx or onnxscript is not installed.
     """
-    try:
+
+    def edit(model: Any) -> None:
         import onnx
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ValueError(f"{path} needs onnx and onnxscript: pip install 'torchrl-mcp[onnx]'") from error
-    with replacing(path) as partial, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's exporter warns about itself
-        torch.onnx.export(
-            export(policy, states),
-            f=partial,
-            input_names=list(INPUTS),
-            output_names=["action"],
-            external_data=False,
-            verbose=False,
-        )
-        model = onnx.load(partial)
+
         _name_batch(model.graph)
         onnx.helper.set_model_props(model, dict(metadata))
-        onnx.save(model, partial)
+
+    require_onnx(path)
+    write_program(export(policy, states), path, inputs=INPUTS, outputs=("action",), edit=edit)
     return onnx_difference(policy, states, path)
 
 

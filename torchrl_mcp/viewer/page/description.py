@@ -1,0 +1,65 @@
+"""What JavaScript must know of a policy and its environment, and which of these it can play."""
+
+import json
+from typing import Any
+
+import mujoco
+
+from torchrl_mcp.envs import Carry, CharacterEnv, Dribble, Heading, Imitation, Location
+from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.tasks.transport_env import Transport
+from torchrl_mcp.runs.interface import interface
+
+TASKS = (Heading, Location, Carry, Dribble)
+"""Tasks that ``tasks.js`` has."""
+
+SHAPES = tuple(f"mjGEOM_{shape}" for shape in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
+"""Shapes that ``drawing.js`` has."""
+
+
+def require_playable(env: CharacterEnv) -> PDCharacterEnv:
+    """Return an environment whose task and character JavaScript knows.
+
+    Raises:
+        ValueError: If it does not know them.
+    """
+    able = ", ".join(task.__name__.lower() for task in TASKS)
+    name = type(env).__name__
+    if isinstance(env, Imitation):
+        raise ValueError(f"the goal of imitation comes from clips, which a page lacks: export a gate for {able}")
+    if type(env) not in TASKS or not isinstance(env, PDCharacterEnv):
+        raise ValueError(f"the page does not know the task {name}: export a gate for {able}")
+    model = env.simulation.model
+    shapes = {mujoco.mjtGeom(shape).name for shape in model.geom_type}
+    if others := sorted(shapes - set(SHAPES)):
+        raise ValueError(f"the page cannot draw the shapes {', '.join(others)} of {env.character.name}: remove them")
+    return env
+
+
+def character(env: PDCharacterEnv) -> dict[str, Any]:
+    """Return what all gates of a character share."""
+    return {
+        "num_bodies": len(env.observation_layout) // 4,  # four quantities for each, after the root's height
+        "num_qpos": len(env.initial_states.rest),
+        "num_qvel": env.initial_states.num_velocities,
+        "physics_timestep": env.simulation.model.opt.timestep,
+        "substeps": env.substeps,
+        "action": json.loads(interface(env)["action"]),
+    }
+
+
+def gate(env: PDCharacterEnv) -> dict[str, Any]:
+    """Return what the task of a gate shows it, and the range of its speeds in m/s."""
+    described: dict[str, Any] = {"task": type(env).__name__, "goal": list(env.goal_layout), "waypoint": False}
+    if isinstance(env, Location):
+        return {**described, "speeds": [0.0, env.speed]}
+    if isinstance(env, Heading):
+        return {**described, "waypoint": env.waypoint, "speeds": list(env.speeds)}
+    assert isinstance(env, Transport)
+    return {
+        **described,
+        "waypoint": env.waypoint,
+        "logarithmic": env.goal_positions == "logarithmic",
+        "objects": list(env.objects.items()),
+        "carrier": env.character.carrier,
+    }

@@ -1,0 +1,107 @@
+// What a policy observes, for one simulation: observations.py, and the goals of envs/tasks, with the same names.
+// Positions are in metres and angles in radians; quaternions are (w, x, y, z).
+
+export const LINEAR_DISTANCE = 0.25; // transport.py
+export const ARRIVAL_DISTANCE = 0.3; // rewards.py
+const WALK_AHEAD = 1.5; // seconds; this and what follows: waypoints.py
+const [STRIDE, PUSH, SHARE, BEHIND, ASIDE, STEP] = [1.0, 0.5, 0.1, 0.7, Math.PI / 4, 0.5];
+const [SUCCESS_DISTANCE, SUCCESS_REACH] = [0.5, 2.0]; // transport.py
+
+/** Horizontal angle of a body's x axis from the world's. */
+export const heading = ([w, x, y, z]) => Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z));
+
+/** A vector of three components of an array, the `index`-th. */
+export const vector = (array, index) => [array[3 * index], array[3 * index + 1], array[3 * index + 2]];
+
+export const quaternion = (array, index) => Array.from(array.subarray(4 * index, 4 * index + 4));
+
+const turned = ([x, y], angle) => {
+  const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
+  return [x * cos + y * sin, y * cos - x * sin];
+};
+
+/** Position, orientation, linear and angular velocity of a body, in the frame of an origin and a heading: 13 numbers. */
+export function body_in_heading_frame(angle, origin, model, data, body) {
+  const [vx, vy, vz] = [3, 4, 5].map((axis) => data.cvel[6 * body + axis]);
+  const spin = [0, 1, 2].map((axis) => data.cvel[6 * body + axis]);
+  const place = vector(data.xpos, body);
+  const centre = vector(data.subtree_com, model.body_rootid[body]);
+  const [x, y, z] = place.map((value, axis) => value - centre[axis]);
+  const [a, b, c] = spin; // v = v_c + spin x (place - centre)
+  const velocity = [vx + b * z - c * y, vy + c * x - a * z, vz + a * y - b * x];
+  const [w, i, j, k] = quaternion(data.xquat, body);
+  const [qw, qz] = turned([w, k], angle / 2);
+  const [qx, qy] = turned([i, j], angle / 2);
+  const sign = qw < 0 || Object.is(qw, -0) ? -1 : 1;
+  const seen = (values) => [...turned(values, angle), values[2]];
+  const offset = place.map((value, axis) => value - origin[axis]);
+  return [...seen(offset), sign * qw, sign * qx, sign * qy, sign * qz, ...seen(velocity), ...seen(spin)];
+}
+
+/** State of a character whose bodies are the first of the scene: its root's height, and what it sees of each body. */
+export function character_state(model, data, num_bodies) {
+  const [angle, root] = [heading(quaternion(data.xquat, 1)), vector(data.xpos, 1)];
+  const bodies = Array.from({ length: num_bodies }, (_, index) => index + 1);
+  return [root[2], ...bodies.flatMap((body) => body_in_heading_frame(angle, root, model, data, body))];
+}
+
+/** Positions of the same direction whose distance is logarithmic. */
+export function logarithmic([x, y]) {
+  const distance = Math.hypot(x, y);
+  const factor = distance > 0 ? Math.log1p(distance / LINEAR_DISTANCE) / distance : 0;
+  return [factor * x, factor * y];
+}
+
+/** A place relative to the centre of mass, in the character's heading frame. */
+export const way = (data, [x, y]) =>
+  turned([x - data.subtree_com[3], y - data.subtree_com[4]], heading(quaternion(data.xquat, 1)));
+
+export const place_seen = (data, place) => logarithmic(way(data, place));
+
+export const place_ahead = ([x, y], [vx, vy]) => [x + WALK_AHEAD * vx, y + WALK_AHEAD * vy];
+
+/** Replace places far aside, which a character could face only by turning on the spot. */
+export function walkable([x, y]) {
+  const [angle, distance] = [Math.atan2(y, x), Math.hypot(x, y)];
+  if (Math.abs(angle) <= ASIDE) return [x, y];
+  if (distance > STEP) return steps(STEP, ASIDE * Math.sign(angle));
+  return distance < ARRIVAL_DISTANCE ? [0, 0] : [x, y];
+}
+
+export const steps = (distance, direction) => [distance * Math.cos(direction), distance * Math.sin(direction)];
+
+export const apart = ([x, y], [u, v]) => Math.hypot(x - u, y - v);
+
+const normalized = ([x, y]) => [x, y].map((value) => value / Math.max(Math.hypot(x, y), 1e-12));
+
+/** What a character sees of objects, by the number of entries of each body, and the place to go to next. */
+export function goal_of(model, data, sizes, is_logarithmic, waypoint) {
+  const [angle, root] = [heading(quaternion(data.xquat, 1)), vector(data.xpos, 1)];
+  const seen = sizes.flatMap(([body, size]) => {
+    const [x, y, ...rest] = body_in_heading_frame(angle, root, model, data, body);
+    return [...(is_logarithmic ? logarithmic([x, y]) : [x, y]), ...rest].slice(0, size);
+  });
+  return waypoint ? [...seen, ...place_seen(data, waypoint)] : seen;
+}
+
+/** The box, then on the way on which the box in hand comes to the target, then where the character stands. */
+export function carry_waypoint(com, box, target, taken, held) {
+  if (!held) return taken ? com : box;
+  const [x, y] = normalized([target[0] - box[0], target[1] - box[1]]);
+  const length = Math.min(apart(target, box) + ARRIVAL_DISTANCE, STRIDE);
+  return [com[0] + length * x, com[1] + length * y];
+}
+
+/** Around the ball until the character is behind it, then through it, then where the character stands. */
+export function dribble_waypoint(com, ball, rest, target) {
+  if (apart(rest, target) < SUCCESS_DISTANCE) return apart(com, ball) < SUCCESS_REACH ? com : ball;
+  const meeting = [(ball[0] + rest[0]) / 2, (ball[1] + rest[1]) / 2];
+  const approach = normalized([meeting[0] - com[0], meeting[1] - com[1]]);
+  const onward = normalized([target[0] - meeting[0], target[1] - meeting[1]]);
+  const left = [-onward[1], onward[0]];
+  const alignment = approach[0] * onward[0] + approach[1] * onward[1];
+  const side = alignment < 0 ? -Math.sign(approach[0] * left[0] + approach[1] * left[1]) : 0;
+  const beyond = Math.min(SHARE * apart(target, meeting), PUSH);
+  const offset = (axis) => (alignment > BEHIND ? beyond * onward[axis] : PUSH * (side * left[axis] - onward[axis]));
+  return [meeting[0] + offset(0), meeting[1] + offset(1)];
+}
