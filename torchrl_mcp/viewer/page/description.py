@@ -7,7 +7,7 @@ import mujoco
 
 from torchrl_mcp.envs import Carry, CharacterEnv, Dribble, Heading, Imitation, Location
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
-from torchrl_mcp.envs.tasks.transport_env import Transport
+from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.runs.interface import interface
 
 TASKS = (Heading, Location, Carry, Dribble)
