@@ -76,11 +76,6 @@ def test_legs_that_the_rest_pose_spreads_hang_straight_when_the_motion_closes_th
     np.testing.assert_allclose(clip.qpos[0], expected, atol=1e-7)
 
 
-def test_a_rest_pose_that_does_not_stand_is_refused(load, own_frames):
-    with pytest.raises(MotionFormatError, match=r"motion\.bvh: its rest pose does not stand .* --rest-frame 0, or"):
-        load([{}] * 2, frames=own_frames)
-
-
 def test_a_frame_in_which_the_body_stands_takes_the_place_of_the_rest_pose(load, any_pose, own_frames):
     path = [(0, 0.9, 0), (0.1, 0.9, 0), (0.1, 0.9, 0)]
     expected = load([{}, any_pose, any_pose], fps=2.0, path=path)
@@ -117,5 +112,5 @@ def test_a_frame_that_does_not_stand_is_refused_by_its_number(load, about):
     sitting = {f"{side}UpLeg": about([-1, 0, 0], 80) for side in ("Left", "Right")}
     sitting |= {f"{side}Leg": about([1, 0, 0], 80) for side in ("Left", "Right")}
     assert load([{}, sitting], fps=2.0, options={"rest_frame": 0}).character == "humanoid"
-    with pytest.raises(MotionFormatError, match=r"frame 1 does not stand .* --rest-frame 0"):
+    with pytest.raises(MotionFormatError, match=r"frame 1 does not stand .*--rest-frame 0"):
         load([{}, sitting], fps=2.0, options={"rest_frame": 1})
