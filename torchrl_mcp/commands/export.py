@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_mcp.runs import builtin, policies
-from torchrl_mcp.viewer.page.folder import write_page
+from torchrl_mcp.viewer.page.folder import Player, write_page
 
 
 def page(checkpoints: Sequence[Path], folder: Path, *, words: Sequence[str]) -> str:
@@ -19,7 +19,7 @@ def page(checkpoints: Sequence[Path], folder: Path, *, words: Sequence[str]) -> 
     Raises:
         ValueError: If there is no checkpoint, it is damaged, or the page cannot play it.
     """
-    players = {}
+    players: dict[str, Player] = {}
     for path in checkpoints:
         cfg, agent, env = policies.restore(path, num_envs=1, seed=0)
         name = path.stem.rpartition("-")[2] if path.parent == builtin.FOLDER else cfg.task.name
