@@ -2,9 +2,8 @@
 
 import shutil
 from collections.abc import Mapping
-from importlib.resources import as_file, files
+from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
@@ -40,26 +39,25 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
     """
     require_onnx(folder)
     envs = [description.require_playable(env) for _, env in players.values()]
-    parts = [stages(policy) for policy, _ in players.values()]
-    require_same_primitives(parts)
+    policies = [stages(policy) for policy, _ in players.values()]
+    require_same_primitives(policies)
     libraries = runtimes()
     scenes = [for_browser(env.scene) for env in envs]
     for env, scene in zip(envs, scenes, strict=True):
         require_same_model(scene, env.simulation.model, libraries)
     _copy(libraries, folder)
-    gates: list[dict[str, Any]] = []
-    for index, (name, env) in enumerate(zip(players, envs, strict=True)):
-        state = env.reset()[:1].select("observation", "goal")
-        for part, stage in parts[index].items():
-            if part == "gate" or index == 0:
-                write_stage(
-                    stage, state, folder / (f"gate-{index}.onnx" if part == "gate" else f"{part}.onnx"), half=half
-                )
-            stage.evaluate(state)
-        with replacing(folder / f"scene-{index}.xml") as partial:
+    gates = []
+    for index, (name, env, policy) in enumerate(zip(players, envs, policies, strict=True)):
+        files = {"scene": f"scene-{index}.xml", "network": f"gate-{index}.onnx"}
+        with replacing(folder / files["scene"]) as partial:
             partial.write_text(scenes[index], encoding="utf-8")
-        files_ = {"scene": f"scene-{index}.xml", "network": f"gate-{index}.onnx"}
-        gates.append({"name": name, **files_, **description.gate(env)})
+        names = {"primitives": "primitives.onnx", "gate": files["network"], "mixer": "mixer.onnx"}
+        state = env.reset()[:1].select("observation", "goal")
+        for part, stage in policy.items():
+            if part == "gate" or index == 0:  # the others are the same for all gates
+                write_stage(stage, state, folder / names[part], half=half)
+            stage.evaluate(state)
+        gates.append({"name": name, **files, **description.gate(env)})
     about = {"title": title, "command": command, **description.character(envs[0]), "gates": gates}
     write_json(about, folder / ABOUT)
 
@@ -67,7 +65,7 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
 def _copy(libraries: Path, folder: Path) -> None:
     """Copy page and runtimes to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    with as_file(files(__package__) / "static") as page:
+    with resources.as_file(resources.files(__package__) / "static") as page:
         shutil.copytree(page, folder, dirs_exist_ok=True)
     shutil.copytree(libraries, folder / "runtimes", dirs_exist_ok=True)
     (folder / "runtimes" / NOTICES).replace(folder / NOTICES)

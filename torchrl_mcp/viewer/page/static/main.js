@@ -8,7 +8,7 @@ const SPEEDS = [1, 0.5, 0.2]; // of time
 const [PUSH_SECONDS, PUSH_SPEED] = [0.15, 0.5]; // a push adds so many m/s to the whole body
 const [SLACK, DEBT, FALLEN_SECONDS] = [6, 0.1, 2]; // pixels of a click; seconds to catch up; until the next episode
 
-const LEAST_PICTURES = 20; // per second: below, after two seconds, pictures become simpler
+const LEAST_PICTURES = 20; // per second: below, after a second, pictures become simpler
 
 const element = (id) => document.getElementById(id);
 
@@ -42,7 +42,7 @@ class Page {
 
   /** Simulate what is due, draw, and wait for the next picture; a hidden page has no pictures and stands still. */
   async frame(now) {
-    const seconds = Math.min((now - this.last) / 1000, 1);
+    const seconds = Math.min(Math.max(now - this.last, 0) / 1000, 1); // a picture's time may lie before the last event
     this.last = now;
     if (!this.paused) await this.simulate(seconds);
     this.drawing.draw(this.task.arrows(), seconds);
@@ -77,10 +77,11 @@ class Page {
     const pace = pictures.wanted ? pictures.simulated / pictures.wanted : 0;
     const slow = pace < 0.93 * SPEEDS[this.pace];
     const time = this.paused ? "paused" : pace > 0.93 ? "real time" : `${pace.toFixed(2)} × real time`;
-    const reason = this.simulation.fallen ? ": fallen, stands up soon" : !this.paused && slow ? ": this device is too slow" : "";
-    element("status").textContent = `${Math.round(pictures.count / seconds)} frames/s · ${time}${reason}`;
+    const reason = !this.paused && slow ? ": this device is too slow" : "";
+    const fall = this.simulation.fallen ? " · fallen, stands up soon" : "";
+    element("status").textContent = `${Math.round(pictures.count / seconds)} frames/s · ${time}${reason}${fall}`;
     this.few = pictures.count / seconds < LEAST_PICTURES ? this.few + 1 : 0;
-    if (this.few === 4) this.drawing.lighten();
+    if (this.few === 2) this.drawing.lighten();
     this.pictures = { since: now, count: 0, simulated: 0, wanted: 0 };
   }
 
@@ -213,7 +214,7 @@ class Page {
 }
 
 const HELP = {
-  Heading: "Click the ground, or press ← and →: the character turns there. ↑ and ↓ change the speed if the gate knows others.",
+  Heading: "Click the ground, or press ← and →: the character turns. ↑ and ↓ change the speed if the gate has others.",
   Location: "Click the ground: the character goes there. Or lead it with ← → ↑ ↓; Space stops it.",
   Carry: "Click the ground: the red table moves there, and the character brings the box.",
   Dribble: "Click the ground: the target moves there, and the character brings the ball.",
