@@ -11,6 +11,7 @@ HEIGHT = 250
 PALETTE = {"input": "#dbe4ee", "primitives": "#cfe8d5", "gate": "#fbe3c4", "product": "#e4daf3"}
 CURVES = ((0.15, 0.05), (0.35, 0.09), (0.5, 0.04), (0.62, 0.12), (0.8, 0.06))
 """Centre and width of the primitives' bells, as shares of their box."""
+FORMULA = "π(a | s, g) = 1/Z ∏ πᵢʷⁱ"
 
 STYLE = "font-family='Helvetica, Arial, sans-serif' fill='#1b1f24'"
 
@@ -69,7 +70,7 @@ def drawing() -> str:
         bells(188, 58, 190, 52),
         box(168, 134, 230, 108, "gate", "gate w(s, g)", "trained anew for every task"),
         bars(218, 184, 130, 48),
-        box(462, 72, 178, 104, "product", "product", "π(a | s, g) = 1/Z ∏ πᵢʷⁱ", "one Gaussian again", "trained with PPO"),
+        box(462, 72, 178, 104, "product", "product", FORMULA, "one Gaussian again", "trained with PPO"),
         box(700, 104, 72, 40, "input", "action"),
         arrow((104, 60), (166, 60)),
         arrow((104, 188), (166, 188)),
