@@ -1,4 +1,4 @@
-"""The drawing of the idea in the README: ``python docs/pictures/diagram.py`` writes ``mcp.svg`` beside itself.
+"""Drawings: ``python docs/pictures/diagram.py`` writes ``mcp.svg`` and ``architecture.svg`` beside itself.
 
 Every text stands on a pale box and every arrow is grey, so that the picture can be read on white and on black.
 """
@@ -6,8 +6,6 @@ Every text stands on a pale box and every arrow is grey, so that the picture can
 import math
 from pathlib import Path
 
-WIDTH = 780
-HEIGHT = 250
 PALETTE = {"input": "#dbe4ee", "primitives": "#cfe8d5", "gate": "#fbe3c4", "product": "#e4daf3"}
 CURVES = ((0.15, 0.05), (0.35, 0.09), (0.5, 0.04), (0.62, 0.12), (0.8, 0.06))
 """Centre and width of the primitives' bells, as shares of their box."""
@@ -57,13 +55,25 @@ def bars(x: int, y: int, width: int, height: int) -> str:
     )
 
 
-def drawing() -> str:
-    """Return the picture as SVG."""
-    title = "The state goes to eight primitives, state and goal to the gate; their product is the policy"
-    parts = [
-        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {WIDTH} {HEIGHT}' role='img' aria-label='{title}'>",
-        "<defs><marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='5' markerHeight='5' orient='auto'>"
-        "<path d='M0,0 L8,4 L0,8 z' fill='#8b949e'/></marker></defs>",
+def picture(title: str, width: int, height: int, *parts: str) -> str:
+    """Return a picture as SVG."""
+    return "\n".join(
+        [
+            f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width} {height}' role='img' aria-label='{title}'>",
+            "<defs><marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='5' markerHeight='5' "
+            "orient='auto'><path d='M0,0 L8,4 L0,8 z' fill='#8b949e'/></marker></defs>",
+            *parts,
+            "</svg>\n",
+        ]
+    )
+
+
+def idea() -> str:
+    """Return the drawing of the idea."""
+    return picture(
+        "The state goes to eight primitives, state and goal to the gate; their product is the policy",
+        780,
+        250,
         box(8, 40, 96, 40, "input", "state s"),
         box(8, 168, 96, 40, "input", "goal g"),
         box(168, 8, 230, 112, "primitives", "8 primitives πᵢ(a | s)", "imitate motions, then frozen"),
@@ -78,10 +88,70 @@ def drawing() -> str:
         arrow((398, 64), (430, 64), (430, 108), (460, 108)),
         arrow((398, 188), (430, 188), (430, 140), (460, 140)),
         arrow((640, 124), (698, 124)),
-        "</svg>",
-    ]
-    return "\n".join(parts) + "\n"
+    )
+
+
+def architecture() -> str:
+    """Return the drawing of how data flow from a command to a gradient."""
+    return picture(
+        "From a command over the configuration to environments, agent and objective, which the loop trains",
+        780,
+        470,
+        box(8, 8, 200, 64, "input", "command", "cli/train.py, conf/*.yaml"),
+        box(290, 8, 200, 64, "input", "plan and checks", "runs/experiment.py"),
+        box(572, 8, 200, 64, "input", "builder", "runs/build.py"),
+        arrow((208, 40), (288, 40)),
+        arrow((490, 40), (570, 40)),
+        box(
+            8,
+            122,
+            230,
+            104,
+            "primitives",
+            "environments",
+            "envs/tasks/*.py: goal, reward",
+            "envs/base.py: steps, resets",
+            "envs/physics/: MuJoCo",
+        ),
+        box(
+            275,
+            122,
+            230,
+            104,
+            "gate",
+            "agent",
+            "methods/*.py: actor",
+            "modules/: networks",
+            "distributions/: product, sum",
+        ),
+        box(
+            542,
+            122,
+            230,
+            104,
+            "product",
+            "objective",
+            "objectives/ppo.py: losses",
+            "objectives/advantages.py",
+            "conf/optimizer: Adam",
+        ),
+        arrow((672, 72), (672, 98), (123, 98), (123, 120)),
+        arrow((672, 72), (672, 98), (390, 98), (390, 120)),
+        arrow((672, 72), (672, 120)),
+        box(8, 282, 764, 40, "input", "the loop: training/trainer.py"),
+        arrow((123, 226), (123, 280)),
+        arrow((390, 226), (390, 280)),
+        arrow((657, 226), (657, 280)),
+        box(8, 362, 230, 84, "primitives", "collect", "training/collectors.py", "N environments × T steps"),
+        box(275, 362, 230, 84, "product", "update", "training/update.py", "advantages, losses, steps"),
+        box(542, 362, 230, 84, "input", "record", "training/metrics.py", "training/checkpoint.py"),
+        arrow((123, 322), (123, 360)),
+        arrow((238, 404), (273, 404)),
+        arrow((505, 404), (540, 404)),
+        arrow((657, 362), (657, 324)),
+    )
 
 
 if __name__ == "__main__":
-    Path(__file__).with_name("mcp.svg").write_text(drawing(), encoding="utf-8")
+    for name, draw in (("mcp", idea), ("architecture", architecture)):
+        Path(__file__).with_name(f"{name}.svg").write_text(draw(), encoding="utf-8")
