@@ -16,7 +16,7 @@ def interval(name: str, value: Sequence[float]) -> tuple[float, float]:
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
     if not -math.inf < low <= high < math.inf:
-        raise ValueError(f"{name}={value!r} is no interval: pass two finite numbers (lo, hi), lo <= hi")
+        raise ValueError(f"{name}={value!r} must be an interval: pass two finite numbers (lo, hi), lo <= hi")
     return low, high
 
 

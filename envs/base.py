@@ -433,7 +433,7 @@ class CharacterEnv(EnvBase):
             raise ValueError(f"set_state=True without {sorted(missing)}: pass at least qpos and qvel, or get_state()")
         for key, value in given.items():
             if key not in known:
-                raise ValueError(f"{key!r} is no part of the state: remove it; the parts are {sorted(known)}")
+                raise ValueError(f"{key!r} is not a part of the state: remove it; the parts are {sorted(known)}")
             if value.shape != known[key].shape:
                 raise ValueError(f"{key} has shape {tuple(value.shape)}: pass {tuple(known[key].shape)}")
             if value.dtype is not torch.bool and not (value[ids].abs() < LARGEST).all():

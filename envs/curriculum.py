@@ -63,7 +63,7 @@ class Curriculum:
             return given
         known = ", ".join(field.name for field in fields(cls))
         if not isinstance(given, Mapping | None):
-            raise ValueError(f"curriculum={given} is no curriculum: pass null for none, or some of {known} by name")
+            raise ValueError(f"curriculum={given} is not a curriculum: pass null for none, or some of {known} by name")
         arguments = dict(given or {})
         if unknown := arguments.keys() - {field.name for field in fields(cls)}:
             raise ValueError(f"curriculum names {sorted(unknown)}: pass some of {known}")

@@ -253,7 +253,7 @@ def _actuators(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
     servo = model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0]
     servo &= (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     if torques := [model.actuator(index).name for index in np.flatnonzero(~servo)]:
-        found = f"{len(torques)} actuators are no position servos ({', '.join(torques)})"
+        found = f"{len(torques)} actuators are not position servos ({', '.join(torques)})"
         yield Violation(found, "make them <position>: targets would be taken for torques")
     if free := [model.actuator(index).name for index in np.flatnonzero(model.actuator_ctrllimited == 0)]:
         yield Violation(
@@ -314,7 +314,7 @@ def _symmetry(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
         return  # a violation of the names
     if crooked := list(without_mirror_image(model, sides)):
         yield Violation(
-            f"the frames of {', '.join(crooked)} are no mirror images of the other side's in the rest pose",
+            f"the frames of {', '.join(crooked)} are not mirror images of those of the other side in the rest pose",
             "turn them, with x forward and y to the left, or name all sides (--sides): mirrored motions would be wrong",
         )
 

@@ -82,7 +82,7 @@ def _hinges(model: mujoco.MjModel, pattern: str, word: str) -> list[int]:
     try:
         found = [hinge for hinge in hinges if re.search(pattern, names[hinge])]
     except re.error as error:
-        raise ValueError(f"--pose {word}: {pattern} is no regular expression: {error}") from error
+        raise ValueError(f"--pose {word}: {pattern} is not a regular expression: {error}") from error
     if found:
         return found
     raise ValueError(f"--pose {word} matches no hinge: they are {', '.join(names.values())}")
@@ -92,14 +92,14 @@ def _number(text: str, word: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"--pose {word}: {text!r} is no angle in radians") from None
+        raise ValueError(f"--pose {word}: {text!r} is not an angle in radians") from None
 
 
 def _keyframe(model: mujoco.MjModel, word: str) -> int:
     names = [model.key(key).name or str(key) for key in range(model.nkey)]
     if word not in names:
         there = f"its keyframes are {', '.join(names)}" if names else "it has none, so give angles, such as knee=-1.2"
-        raise ValueError(f"--pose {word} is no keyframe of the file: {there}")
+        raise ValueError(f"--pose {word} is not a keyframe of the file: {there}")
     return names.index(word)
 
 

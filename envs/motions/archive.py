@@ -76,7 +76,7 @@ class Archive:
         """
         array = self.array(name)
         if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-            raise self.error(f"its array {name} holds what is no finite number: correct it")
+            raise self.error(f"its array {name} holds a value that is not a finite number: correct it")
         if width and (array.shape[1:] != width or len(array) < 2):
             expected = ", ".join(map(str, width))
             raise self.error(f"its array {name} has shape {array.shape}, and should have (T, {expected}) with T >= 2")
@@ -86,12 +86,12 @@ class Archive:
         """Return the first of the named numbers that the archive has, or None.
 
         Raises:
-            MotionFormatError: If it is no positive number.
+            MotionFormatError: If it must be a positive number.
         """
         for name in names:
             if name in self.names:
                 values = self.numbers(name)
                 if values.numel() != 1 or float(values) <= 0:
-                    raise self.error(f"its {name} is no positive number: correct it")
+                    raise self.error(f"its {name} must be a positive number: correct it")
                 return float(values)
         return None

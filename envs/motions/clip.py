@@ -62,7 +62,7 @@ class MotionClip:
         if self.qpos.ndim != 2 or self.qpos.shape[1] != layout.nq or len(self.qpos) < 2:
             raise ValueError(f"qpos has shape {tuple(self.qpos.shape)}: pass (T, {layout.nq}) with T >= 2")
         if not 0 < self.fps < math.inf:
-            raise ValueError(f"fps={self.fps} is no frame rate: pass a positive, finite number")
+            raise ValueError(f"fps={self.fps} must be a positive, finite frame rate")
         qpos = self.qpos.detach().to("cpu", torch.float64, copy=True)
         if not qpos.isfinite().all():
             frame = int((~qpos.isfinite()).any(-1).nonzero()[0])
@@ -144,7 +144,7 @@ class MotionClip:
         """
         if not 0 <= start < stop <= self.duration + 1e-9:
             raise ValueError(
-                f"start={start}, stop={stop} is no part of the clip: pass 0 <= start < stop <= {self.duration:g}"
+                f"start={start}, stop={stop} is not a part of the clip: pass 0 <= start < stop <= {self.duration:g}"
             )
         frames = max(1, round((stop - start) * self.fps))
         times = start + torch.arange(frames + 1, dtype=torch.float64) / self.fps
@@ -176,7 +176,8 @@ class MotionClip:
         except UNREADABLE as error:
             raise MotionFormatError(
                 path,
-                f"is no motion clip: {error}. Pass one that torchrl-mcp-motions import has written, or write it anew",
+                f"is not a motion clip: {error}. Pass one that torchrl-mcp-motions import has written, or import it "
+                "again",
             ) from error
 
     @classmethod

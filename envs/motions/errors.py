@@ -12,8 +12,8 @@ class MotionFormatError(ValueError):
         line: Number of the line, from 1, if known.
 
     Example:
-        >>> print(MotionFormatError("walk.bvh", "'one' is no number: correct it", line=12))
-        walk.bvh:12: 'one' is no number: correct it
+        >>> print(MotionFormatError("walk.bvh", "'one' is not a number: correct it", line=12))
+        walk.bvh:12: 'one' is not a number: correct it
     """
 
     def __init__(self, path: str | Path, message: str, line: int | None = None) -> None:

@@ -21,7 +21,9 @@ def single_motion(character: str, clip: str | None = None) -> MotionLibrary:
     clips = _walks(character)
     name = next(iter(clips)) if clip is None else clip
     if name not in clips:
-        raise ValueError(f"clip={clip!r} is no generated motion of character={character!r}: pass one of {list(clips)}")
+        raise ValueError(
+            f"clip={clip!r} is not a generated motion of character={character!r}: pass one of {list(clips)}"
+        )
     return MotionLibrary({name: clips[name]})
 
 

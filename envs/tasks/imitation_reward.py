@@ -42,7 +42,7 @@ def checked_terms(terms: Mapping[str, Mapping[str, float]]) -> dict[str, Term]:
         raise ValueError(f"terms are empty: pass weight and scale of one or more of {', '.join(ERRORS)}")
     for name, term in terms.items():
         if name not in ERRORS:
-            raise ValueError(f"terms names {name!r}, which is no error: pass some of {', '.join(ERRORS)}")
+            raise ValueError(f"terms names {name!r}, which is not an error: pass some of {', '.join(ERRORS)}")
         if set(term) != set(Term._fields):
             raise ValueError(f"the term {name} has {', '.join(term) or 'nothing'}: pass {' and '.join(Term._fields)}")
         positive(**{f"terms.{name}.weight": term["weight"]})

@@ -52,7 +52,7 @@ def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], 
                 if sys.flags.dev_mode:
                     raise
                 if isinstance(error, yaml.YAMLError):
-                    sys.exit(f"{program}: settings are no YAML: {' '.join(str(error).split())}")
+                    sys.exit(f"{program}: settings are not YAML: {' '.join(str(error).split())}")
                 sys.exit(f"{program}: {error}")
 
         return run
@@ -95,7 +95,7 @@ def seconds(text: str) -> float:
     except ValueError:
         duration = 0.0
     if not 0 < duration < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no duration: pass more than 0 seconds")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a duration: pass more than 0 seconds")
     return duration
 
 
@@ -112,7 +112,7 @@ def port(text: str) -> int:
 def _whole(text: str, low: int, high: int | None) -> int:
     if not text.isdecimal() or int(text) < low or (high is not None and int(text) > high):
         limits = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number {limits}")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number {limits}")
     return int(text)
 
 

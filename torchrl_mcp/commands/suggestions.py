@@ -38,7 +38,9 @@ def stray(words: Sequence[str]) -> list[str]:
     values = {follower for word, follower in pairwise(words) if word.startswith("-") and "=" not in word}
     strays = [word for word in words if "=" not in word or word == "="]
     strays = [word for word in strays if not word.startswith(("-", "~")) and word not in values]
-    return [f"{' '.join(strays)} is no setting: write NAME=VALUE without spaces, such as method=mcp"] if strays else []
+    return (
+        [f"{' '.join(strays)} is not a setting: write NAME=VALUE without spaces, such as method=mcp"] if strays else []
+    )
 
 
 def unreadable(settings: Sequence[str]) -> list[str]:
@@ -70,7 +72,7 @@ def suggestions(settings: Sequence[str]) -> list[str]:
     return [
         f"{key!r} is in no file, but is a valid argument: write it with a plus, +{key}=..."
         if _is_argument(key, cfg)
-        else f"{key!r} is no setting of this method" + _nearest(key, {*groups, *known})
+        else f"{key!r} is not a setting of this method" + _nearest(key, {*groups, *known})
         for key in unknown
     ]
 

@@ -54,7 +54,7 @@ def follow_each(
             "clip_end='truncate'"
         )
     if env.num_envs % count:
-        raise ValueError(f"num_envs={env.num_envs} is no multiple of the number of clips, {count}")
+        raise ValueError(f"num_envs={env.num_envs} must be a multiple of the number of clips, {count}")
     episodes = env.num_envs // count
     needed = (env.max_episode_steps + 2) * env.control_timestep
     latest = torch.where(library.loops | (library.durations < needed), library.durations, library.durations - needed)

@@ -179,7 +179,7 @@ class EpsilonGreedy(Choice):
 
     def __init__(self, values: Tensor, epsilon: float) -> None:
         if not 0 <= epsilon <= 1:
-            raise ValueError(f"epsilon={epsilon} is no probability: pass a number from 0 to 1")
+            raise ValueError(f"epsilon={epsilon} must be a probability: pass a number from 0 to 1")
         self._best = values.argmax(-1)
         best = nn.functional.one_hot(self._best, values.shape[-1])
         super().__init__(probs=(1 - epsilon) * best + epsilon / values.shape[-1])

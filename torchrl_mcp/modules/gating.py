@@ -98,7 +98,7 @@ def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
         ValueError: If they are no list of layers, or a layer would have no units.
     """
     if isinstance(num_cells, int) or not num_cells:
-        raise ValueError(f"num_cells={num_cells} is no list of layers: pass the units of at least one, such as [64]")
+        raise ValueError(f"num_cells={num_cells} must be a list with the units of at least one layer, such as [64]")
     scaled = [round(cells * width) for cells in num_cells]
     if min(scaled) < 1:
         raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")

@@ -92,7 +92,7 @@ def require_callable(config: Any, path: str = "") -> None:
         unknown = [str(key) for key in config if key not in taken and not str(key).startswith("_")]
         if unknown and not any(map(_is_open, taken.values())):
             near = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
-            raise ValueError(f"{path}.{unknown[0]} is no argument of {name}; the nearest are: {', '.join(near)}")
+            raise ValueError(f"{path}.{unknown[0]} is not an argument of {name}; the nearest are: {', '.join(near)}")
     items = config.items() if isinstance(config, Mapping) else enumerate(config) if isinstance(config, list) else ()
     for key, value in items:
         require_callable(value, f"{path}.{key}" if path else str(key))
@@ -199,7 +199,7 @@ def require_entry(env: CharacterEnv, name: str) -> slice:
     layout = env.goal_layout
     if name not in layout or len(layout) == 1:
         known = f"has {', '.join(layout)}" if len(layout) > 1 else "is one entry: leave it out"
-        raise ValueError(f"transfer.goal_entry={name} is no entry of the task's goal, which {known}")
+        raise ValueError(f"transfer.goal_entry={name} is not an entry of the task's goal, which {known}")
     return layout[name]
 
 

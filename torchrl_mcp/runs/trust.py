@@ -111,10 +111,10 @@ def read_config(path: Path) -> dict[str, Any]:
         OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
-        raise ValueError(f"{path} has more than {LARGEST} bytes: that is no configuration")
+        raise ValueError(f"{path} has more than {LARGEST} bytes: it cannot be a configuration")
     text = path.read_text(encoding="utf-8")
     if _depth(text) > DEEPEST:
-        raise ValueError(f"{path} is no configuration: brackets are nested more than {DEEPEST} deep")
+        raise ValueError(f"{path} is not a configuration: brackets are nested more than {DEEPEST} deep")
     try:
         # With aliases of aliases, a few lines expand to more than memory holds.
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
@@ -122,9 +122,9 @@ def read_config(path: Path) -> dict[str, Any]:
         config: Any = OmegaConf.to_container(OmegaConf.create(text))
     except (yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
         first = str(error).partition("\n")[0] or type(error).__name__
-        raise ValueError(f"{path} is no configuration: {first}") from error
+        raise ValueError(f"{path} is not a configuration: {first}") from error
     if not isinstance(config, dict):
-        raise ValueError(f"{path} is no configuration: it holds no settings")
+        raise ValueError(f"{path} is not a configuration: it holds no settings")
     return config
 
 

@@ -165,7 +165,7 @@ def _order(file: TextFile, statement: Statement, words: Sequence[str]) -> str:
     """Read an order of axes."""
     order = "".join(words).lower()
     if sorted(order) != ["x", "y", "z"]:
-        raise file.error("the order of the axes is none of XYZ, ..., ZYX: correct it", statement.line)
+        raise file.error("the order of the axes must be one of XYZ, ..., ZYX: correct it", statement.line)
     return order
 
 
@@ -197,7 +197,7 @@ def _hierarchy(file: TextFile, section: Sequence[Statement], bones: Mapping[str,
             raise file.error(f"{shortened(parent)} hangs on nothing yet: put its own line first", line)
         for child in children:
             if child not in bones or child in parents:
-                raise file.error(f"{shortened(child)} is no bone, or hangs on two: correct it", line)
+                raise file.error(f"{shortened(child)} is not a bone, or hangs on two bones: correct it", line)
             parents[child] = parent
     if loose := sorted(bones.keys() - parents.keys()):
         raise file.error(f"{shortened(loose[0])} hangs on nothing: add it to :hierarchy")

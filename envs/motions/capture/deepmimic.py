@@ -88,7 +88,7 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
                 f"frame {index + 1} is not of {width} numbers as the first: correct it", _line(file, index)
             )
         if not all(type(number) in (int, float) and abs(number) <= LARGEST_NUMBER for number in frame):
-            message = f"frame {index + 1} holds what is no number, not finite or absurdly large: correct it"
+            message = f"frame {index + 1} holds a value that is not a number, not finite or absurdly large: correct it"
             raise file.error(message, _line(file, index))
     return torch.tensor(frames, dtype=torch.float64), loop in (True, "wrap")
 

@@ -291,7 +291,7 @@ def _require_applicable(path: str | Path, kind: str, options: Mapping[str, Any])
     if wrong := [name for name, value in options.items() if value is not None and name not in OPTIONS[kind]]:
         raise ValueError(f"{wrong[0]} does not apply to {path}, {KINDS[kind]}: leave it out")
     if options["quaternion"] not in (None, *QUATERNIONS):
-        raise ValueError(f"quaternion={options['quaternion']!r} is no order: pass one of {', '.join(QUATERNIONS)}")
+        raise ValueError(f"quaternion={options['quaternion']!r} is not an order: pass one of {', '.join(QUATERNIONS)}")
 
 
 def _skeleton(

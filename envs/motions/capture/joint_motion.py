@@ -39,7 +39,7 @@ def require_human(character: str) -> None:
         ValueError: If it lacks them.
     """
     if character not in HUMANS:
-        raise ValueError(f"character={character!r} has not the joints of a human body: pass one of {', '.join(HUMANS)}")
+        raise ValueError(f"character={character!r} lacks the joints of a human body: pass one of {', '.join(HUMANS)}")
 
 
 class JointMotion(NamedTuple):

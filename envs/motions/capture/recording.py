@@ -116,7 +116,9 @@ def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scal
     """Return the user's unit, or else the one of the file or a usual one that fits the length of the legs."""
     if scale is not None:
         if not 0 < scale < math.inf:
-            raise ValueError(f"scale={scale} is no unit of length: pass metres per unit, such as 0.01 for centimetres")
+            raise ValueError(
+                f"scale={scale} is not a unit of length: pass metres per unit, such as 0.01 for centimetres"
+            )
         return scale
     length, (low, high) = _leg_length(positions), LEG_LENGTHS
     fitting = [unit for unit in UNITS if low <= unit * length <= high]

@@ -111,12 +111,12 @@ def frame_rate(fps: float | None, stated: float | None) -> float | None:
     """Return the user's frames per second, or else the file's.
 
     Raises:
-        ValueError: If the user's value is no frame rate.
+        ValueError: If the user's value cannot be a frame rate.
     """
     if fps is None:
         return stated
     if not 1.0 <= fps <= 10_000.0:
-        raise ValueError(f"fps={fps} is no frame rate of a recording: pass a number from 1 to 10000")
+        raise ValueError(f"fps={fps} cannot be the frame rate of a recording: pass a number from 1 to 10000")
     return fps
 
 

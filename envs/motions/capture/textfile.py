@@ -88,7 +88,7 @@ class TextFile:
         numbers = [parsed(word) for word in words]
         for word, number in zip(words, numbers, strict=True):
             if number is None:
-                raise self.error(f"{shortened(word)} is no number: correct it", line)
+                raise self.error(f"{shortened(word)} is not a number: correct it", line)
             if not abs(number) <= LARGEST_NUMBER:
                 kind = "absurdly large" if math.isfinite(number) else "not finite"
                 raise self.error(f"{shortened(word)} is {kind}: correct it", line)

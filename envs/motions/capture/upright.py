@@ -74,7 +74,7 @@ def upright(
         ValueError: If there is no such axis.
     """
     if up is not None and up not in VERTICALS:
-        raise ValueError(f"up={up!r} is no axis: pass one of {', '.join(VERTICALS)}")
+        raise ValueError(f"up={up!r} is not an axis: pass one of {', '.join(VERTICALS)}")
     moving, body = _parts(joints, frames), _body(_parts(joints, rest))
     if body is None:
         named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"

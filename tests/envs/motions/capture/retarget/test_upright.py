@@ -98,7 +98,7 @@ def test_the_frame_that_the_user_says_stands_wins(load, about, kinematics):
 
 
 def test_an_axis_that_is_none_is_named(load):
-    with pytest.raises(ValueError, match="up='w' is no axis: pass one of x, y, z, -x, -y, -z"):
+    with pytest.raises(ValueError, match="up='w' is not an axis: pass one of x, y, z, -x, -y, -z"):
         load([{}] * 2, options={"up": "w"})
 
 
