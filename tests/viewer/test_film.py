@@ -99,7 +99,7 @@ def test_a_film_of_another_kind_is_refused(tmp_path):
         save_film(IDLE, heading(), tmp_path / "film.avi")
 
 
-@pytest.mark.parametrize(("argument", "value"), [("seconds", 0.01), ("width", 0), ("height", -3)])
-def test_a_film_of_nothing_is_refused_by_the_argument(tmp_path, argument, value):
+@pytest.mark.parametrize(("argument", "value"), [("seconds", 0.01), ("width", 0), ("height", -3), ("width", 20_000)])
+def test_a_film_of_nothing_or_too_large_to_draw_is_refused_by_the_argument(tmp_path, argument, value):
     with pytest.raises(ValueError, match=f"{argument}={value}"):
         save_film(IDLE, heading(), tmp_path / "film.gif", **{argument: value})
