@@ -134,7 +134,8 @@ def test_every_environment_of_every_worker_is_another_and_a_killed_worker_is_nam
 
 @pytest.mark.slow
 @pytest.mark.skipif(not find_spec("ray") or sys.platform != "linux", reason="needs Ray, and Linux's /proc")
-def test_everything_that_ray_started_is_gone_half_a_minute_after_the_run_was_killed(tmp_path):
+def test_everything_that_ray_started_is_gone_soon_after_the_run_was_killed(tmp_path):
+    """Ray's agents wait a minute for its server, which the kernel has ended."""
     arguments = [*SMOKE, f"run_dir={tmp_path}", "collector=ray", "training.total_frames=1000000"]
     run = subprocess.Popen([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], start_new_session=True)
     while not (tmp_path / "metrics.csv").exists():
@@ -143,7 +144,7 @@ def test_everything_that_ray_started_is_gone_half_a_minute_after_the_run_was_kil
     assert len(living(run.pid)) > 5  # the run, two workers, and what serves them
     run.kill()
     run.wait()
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 120
     while living(run.pid) and time.monotonic() < deadline:
         time.sleep(0.5)
     assert not living(run.pid)

@@ -1,7 +1,7 @@
 """Trajectory sources: environments in this process, or in workers on one machine or many."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
-from torchrl_mcp.training import ray_agents, ray_workers
+from torchrl_mcp.training import ray_workers
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
@@ -219,9 +219,8 @@ class RemoteSource:
             **self._backend,
         )
         # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
-        with ExitStack() as watched, threads_kept(), new_workers() as self._workers:
-            self._collector = self._begin(make_collector, watched)
-            self._watched = watched.pop_all()
+        with threads_kept(), new_workers() as self._workers:
+            self._collector = self._begin(make_collector)
         GlobalRNGState().load_state_dict(random)
         self._batches: Iterator[TensorDictBase] | None = None
 
@@ -245,7 +244,6 @@ class RemoteSource:
                 self._collector.shutdown(timeout=PATIENCE)
         finally:
             end(self._workers)
-            self._watched.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of starts of the workers."""
@@ -261,12 +259,11 @@ class RemoteSource:
             raise ValueError("it was written with collector=local: resume with the same collector")
         self._starts = state["starts"]
 
-    def _begin(self, make_collector: Callable[..., Collector], watched: ExitStack) -> Collector:
+    def _begin(self, make_collector: Callable[..., Collector]) -> Collector:
         """Return the collector, after its workers have started."""
         if self._backend["backend"] == "process":
             return _begin_processes(make_collector)
         if self._backend["backend"] == "ray":  # starts in the main thread
-            watched.enter_context(ray_agents.watched())
             with ray_workers.starting():
                 return make_collector(collector_class=ray_workers.RayWorker)
         return make_collector()
