@@ -32,7 +32,6 @@ KEY = "runs/test_keys.py::test_a_setting_that_is_misspelt_or_in_a_wrong_group_is
 BODY = "runs/test_faults.py::test_a_run_does_not_go_on_with_another_body"
 BITS = "training/test_trainer.py::test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit"
 NETWORKS = "runs/test_places.py::test_folders_of_other_networks_have_other_names_wherever_those_are"
-RESTORED = "envs/tasks/test_carry.py::test_a_restored_hold_continues_bit_for_bit"
 LONGER = "runs/test_places.py::test_a_longer_run_goes_on_from_another_folder_after_a_move_as_one_that_was_planned"
 
 FAULTS = {
@@ -211,7 +210,6 @@ FAULTS = {
             "(values.max(axis) < LARGEST) | (values",
             "envs/physics/test_batch.py",
         ),
-        ('if "qacc_warmstart" in fields', "if False", RESTORED),
     ],
     "envs/tasks/rewards.py": [
         ("- speed).square()).exp()", "- speed).abs()).exp()", "envs/tasks/test_heading.py"),
