@@ -41,6 +41,19 @@ def test_without_exploration_the_action_is_deterministic_and_with_it_random(name
     assert (first != second).any(-1).all()
 
 
+@pytest.mark.parametrize("name", ACTORS)
+@pytest.mark.parametrize("key", ["observation", "goal"])
+def test_networks_see_inputs_relative_to_their_running_mean(name, key, make_actor, states):
+    actor, parts = make_actor(name)
+    actions, seen = [], states(10)
+    for _ in range(2):
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            actions.append(actor.policy(seen.clone())["action"])
+        seen[key] += 1
+        parts[f"{key}_normaliser"].mean += 1
+    torch.testing.assert_close(*actions, atol=1e-4, rtol=1e-4)
+
+
 def test_without_exploration_the_most_likely_action_of_each_mixer_is_played(states, make_actor):
     td = states(10)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

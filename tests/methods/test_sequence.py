@@ -78,8 +78,8 @@ def test_weights_fade_linearly_from_one_act_to_the_next_in_every_simulation_at_i
 
 def test_an_episode_begins_with_the_first_act():
     env, primitives = Heading("biped", 1, seed=0, num_threads=1, max_episode_steps=5), Primitives()
-    acts = [act(primitives, [0.0, 0.0], after(0.1)), act(primitives, [20.0, 0.0])]
-    first = play(env, acts, 10, crossfade=0.0)[:, 0, 0]
+    acts = [act(primitives, [0.0, 0.0], after(0.1)), act(primitives, [20.0, 0.0], after(0.1))]
+    first = play(env, acts, 10, crossfade=0.0)[:, 0, 0]  # the last act lasts to the end, also when it is over
     assert first.tolist() == pytest.approx([0.5, 0.5, 0.5, 1.0, 1.0] * 2)
 
 

@@ -33,7 +33,8 @@ def collect(agent, trainer):
     with torch.no_grad():
         batch = trainer.source.env.rollout(8, agent.actor.policy, break_when_any_done=False, auto_reset=True)
     for key in ("observation", "goal"):
-        agent.parts[f"{key}_normaliser"].update(batch[key])  # which begins to tell left from right
+        if (name := f"{key}_normaliser") not in agent.frozen:
+            agent.parts[name].update(batch[key])  # which begins to tell left from right
     with torch.no_grad():
         batch[agent.actor.log_prob] = agent.actor.trained.get_dist(batch).log_prob(batch["action"])
     return batch

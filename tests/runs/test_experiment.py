@@ -1,7 +1,6 @@
 """The command line: what it runs, what it refuses and what it says instead."""
 
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -9,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
-from smoke import SMOKE, contents
+from refusals import contents, refused
+from smoke import SMOKE
 from torch import nn
 
 from torchrl_mcp import conf
@@ -59,24 +59,26 @@ def test_evaluation_reports_as_many_episodes_as_asked_and_writes_them_down(comma
 
 
 @pytest.mark.parametrize(
-    ("arguments", "remedy"),
+    ("arguments", "names"),
     [
-        (["stage=transfer"], "pretrained=<folder>"),
-        (["stage=transfer", "pretrained=nowhere"], "nowhere is neither a checkpoint file nor a run folder"),
-        (["exploration=weights"], "stage=transfer"),
+        (["stage=transfer"], ["pretrained=<folder>"]),
+        (["stage=transfer", "pretrained=nowhere"], ["nowhere"]),
+        (["exploration=weights"], ["stage=transfer"]),
+        (["resume=nowhere", "device=cuda"], ["preset=smoke"]),
+        (["training.minibatch_size=100"], ["minibatch_size=100"]),
+        (["num_primitives=0"], ["num_primitives=0"]),
+        (["stage=transfer", "num_primitives=4", "pretrained={run}"], ["num_primitives=8", "num_primitives=4"]),
         (
-            ["resume=nowhere", "device=cuda"],
-            "leave out preset=smoke logger=none num_threads=1 progress_bar=false",
+            [*["task=heading", "character=humanoid", "method=moe", "stage=transfer", "pretrained=builtin:biped"]],
+            ["method=mcp", "character=biped", "method=moe", "character=humanoid"],
         ),
-        (["training.minibatch_size=100"], "multiple"),
-        (["num_primitives=0"], "num_primitives=0 must be a whole number, at least 1"),
     ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+    ids=lambda value: " ".join(value),
 )
-def test_a_mistake_is_answered_with_what_to_write_instead(command, tmp_path, arguments, remedy):
-    outcome = command("train", *SMOKE, *arguments, cwd=tmp_path)
+def test_a_mistake_is_answered_without_a_traceback_and_nothing_is_written(command, run, tmp_path, arguments, names):
+    outcome = command("train", *SMOKE, *(word.format(run=run) for word in arguments), cwd=tmp_path)
     assert outcome.returncode != 0
-    assert remedy in outcome.stderr
+    assert all(name in outcome.stderr for name in names), outcome.stderr
     assert "Traceback" not in outcome.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -87,7 +89,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_leaves_it_untouched(comm
     other = command("train", *SMOKE, LENGTHS[0], f"run_dir={run}", cwd=run.parents[5])
     assert same.returncode != 0 != other.returncode
     assert f"continue it with torchrl-mcp-train resume={run}" in same.stderr
-    assert "holds a run that differs in task: give another run_dir" in other.stderr
+    assert "differs in task" in other.stderr
     assert contents(run) == before
 
 
@@ -95,10 +97,8 @@ def test_a_folder_with_checkpoints_of_a_run_without_its_configuration_is_refused
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     (copy / "config.yaml").unlink()
-    before = contents(copy)
-    with pytest.raises(ValueError, match=r"config\.yaml is missing: put that back to continue the run"):
-        experiment.train(compose_run(*SMOKE, f"run_dir={copy}"))
-    assert contents(copy) == before
+    cfg = compose_run(*SMOKE, f"run_dir={copy}")
+    refused(lambda: experiment.train(cfg), str(copy), "config.yaml", untouched=copy)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
@@ -108,28 +108,9 @@ def test_a_run_of_a_gpu_goes_on_without_one_if_told_to(run, tmp_path):
     cfg = OmegaConf.load(copy / "config.yaml")
     cfg.device, cfg.training.total_frames = "cuda", 2 * cfg.training.total_frames
     OmegaConf.save(cfg, copy / "config.yaml")
-    before = contents(copy)
-    with pytest.raises(ValueError, match=r"finds no CUDA device. Pass device=cpu"):
-        experiment.resume(copy)
-    assert contents(copy) == before
+    refused(lambda: experiment.resume(copy), "device=cuda", untouched=copy)
     experiment.resume(copy, device="cpu")
     assert records.is_complete(copy)
-
-
-def test_transfer_from_another_architecture_is_refused(command, run, tmp_path):
-    outcome = command("train", *SMOKE, "stage=transfer", "num_primitives=4", f"pretrained={run}", cwd=tmp_path)
-    assert outcome.returncode != 0
-    assert "has networks of num_primitives=8, which do not fit num_primitives=4: change either" in outcome.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_transfer_from_another_character_and_method_names_both(command, tmp_path):
-    arguments = ["task=heading", "character=humanoid", "method=moe", "stage=transfer", "pretrained=builtin:biped"]
-    outcome = command("train", *SMOKE, *arguments, cwd=tmp_path)
-    assert outcome.returncode != 0
-    difference = "networks of method=mcp character=biped, which do not fit method=moe character=humanoid: change either"
-    assert difference in outcome.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 def flip_a_byte(data):
@@ -152,10 +133,10 @@ def test_damage_of_all_checkpoints_stops_a_resume_and_leaves_the_run_folder_unto
     assert contents(copy) == before
 
 
-def test_a_resume_of_no_run_says_what_is_missing(command, tmp_path):
+def test_a_resume_of_no_run_is_refused(command, tmp_path):
     outcome = command("train", "resume=nowhere", cwd=tmp_path)
     assert outcome.returncode != 0
-    assert "nowhere holds no run" in outcome.stderr
+    assert "nowhere" in outcome.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -224,26 +205,15 @@ def of_another_version(evaluated, folder):
 
 def test_a_run_of_another_version_is_refused_with_the_name_it_misses_and_the_remedy(evaluated, tmp_path):
     folder, file = of_another_version(evaluated, tmp_path / "run")
-    before = contents(folder)
     readers = [
         (folder / "config.yaml", lambda: experiment.resume(folder)),
         (folder / "config.yaml", lambda: records.is_complete(folder)),
         (file, lambda: policies.restore(file, num_envs=1, seed=0)),
         (file, lambda: policies.evaluation(file, episodes=1, seed=0)),
+        (folder / "config.yaml", lambda: benchmark.conflict(benchmark.Job(folder, [], {}))),
     ]
     for source, read in readers:
-        with pytest.raises(ValueError, match=re.escape(f"{source} is of another version of torchrl-mcp")) as refusal:
-            read()
-        assert "torchrl_mcp.actors.composite_parts" in str(refusal.value)
-        assert "origin.json" in str(refusal.value)
-    assert contents(folder) == before
-
-
-def test_a_benchmark_does_not_touch_runs_of_another_version(evaluated, tmp_path):
-    folder, _ = of_another_version(evaluated, tmp_path / "run")
-    job = benchmark.Job(folder, [], {})
-    with pytest.raises(ValueError, match="is of another version"):
-        benchmark.conflict(job)
+        refused(read, str(source), "torchrl_mcp.actors.composite_parts", untouched=folder)
 
 
 def test_all_imitation_is_evaluated_in_episodes_of_the_same_length():

@@ -2,6 +2,7 @@
 
 import pytest
 from omegaconf import OmegaConf
+from refusals import refused
 
 from torchrl_mcp.runs import requirements
 from torchrl_mcp.runs.configuration import compose_run
@@ -21,20 +22,19 @@ def test_the_settings_of_the_library_are_all_used_and_its_arguments_taken(method
 
 
 @pytest.mark.parametrize(
-    ("setting", "message"),
+    ("setting", "names"),
     [
-        ("+training.total_framse=1", "training.total_framse: write training.total_frames"),
-        ("+gatng.activation=1", "gatng: write gating"),
-        ("+method.num_primitives=4", "method.num_primitives: begin the file of method= with the line '# @package"),
-        ("+task.task.name=own", "task.task: begin the file of task= with"),
-        ("+preset.seed=1", "preset: begin the file of preset= with"),
-        ("+training.device=cpu", "training.device: write device=..."),
-        ("~seed", "the setting seed is missing: leave ~seed out"),
+        ("+training.total_framse=1", ["training.total_framse", "training.total_frames"]),
+        ("+gatng.activation=1", ["gatng", "gating"]),
+        ("+method.num_primitives=4", ["method.num_primitives"]),
+        ("+task.task.name=own", ["task.task"]),
+        ("+preset.seed=1", ["preset"]),
+        ("+training.device=cpu", ["training.device", "device=..."]),
+        ("~seed", ["seed"]),
     ],
 )
-def test_a_setting_that_is_misspelt_or_in_a_wrong_group_is_named_with_a_remedy(setting, message):
-    with pytest.raises(ValueError, match=message):
-        require_used(compose_run(setting))
+def test_a_setting_that_is_misspelt_or_in_a_wrong_group_is_named(setting, names):
+    refused(lambda: require_used(compose_run(setting)), *names)
 
 
 @pytest.mark.parametrize(
@@ -52,16 +52,15 @@ def test_labels_and_settings_of_ones_own_are_allowed(settings):
 
 
 @pytest.mark.parametrize(
-    ("setting", "message"),
+    ("setting", "names"),
     [
-        ("+task.transfer.max_trn=1", "task.transfer.max_trn is no argument of torchrl_mcp.envs.Heading; .*: max_turn"),
-        ("+critic.widht=1", "critic.widht is no argument of .*value_critic; the nearest are: width"),
+        ("+task.transfer.max_trn=1", ["task.transfer.max_trn", "max_turn"]),
+        ("+critic.widht=1", ["critic.widht", "width"]),
     ],
 )
-def test_an_argument_that_a_class_does_not_take_is_named_with_the_nearest(setting, message):
+def test_an_argument_that_a_class_does_not_take_is_named_with_the_nearest(setting, names):
     cfg = compose_run("task=heading", "stage=transfer", "run_dir=run", setting)
-    with pytest.raises(ValueError, match=message):
-        requirements.require_callable(OmegaConf.to_container(cfg, resolve=True))
+    refused(lambda: requirements.require_callable(OmegaConf.to_container(cfg, resolve=True)), *names)
 
 
 def test_code_of_others_is_left_to_python():
@@ -70,5 +69,4 @@ def test_code_of_others_is_left_to_python():
 
 def test_what_both_stages_share_is_not_given_for_one_of_them():
     cfg = compose_run("task=holdout", "stage=transfer", "+task.transfer.forward_weight=2.0")
-    with pytest.raises(ValueError, match=r"give task\.pretrain\.NAME=VALUE, which holds in both stages"):
-        requirements.require_environment(cfg)
+    refused(lambda: requirements.require_environment(cfg), "task.transfer", "task.pretrain.NAME=VALUE")

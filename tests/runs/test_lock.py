@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from refusals import refused
 
 from torchrl_mcp.runs import lock
 
@@ -57,8 +58,7 @@ def other(tmp_path):
 def test_a_lock_is_held_by_one_who_is_named_until_that_process_dies(other, tmp_path):
     run = tmp_path / "run"
     assert lock.holder(run) == f"process {other.pid} on {socket.gethostname()}"
-    with pytest.raises(ValueError, match=f"process {other.pid} on .* is at work"), lock.held(run):
-        pass
+    refused(lambda: lock.held(run).__enter__(), f"process {other.pid}")
     other.kill()
     other.wait()
     assert lock.holder(run) is None
@@ -67,10 +67,12 @@ def test_a_lock_is_held_by_one_who_is_named_until_that_process_dies(other, tmp_p
     assert lock.holder(run) is None
 
 
-def test_a_lock_can_be_waited_for(other, tmp_path):
-    threading.Timer(1.0, other.kill).start()
+@pytest.mark.parametrize("end", ["kill", "communicate"])
+def test_a_lock_that_is_waited_for_is_one_that_others_see(other, tmp_path, end):
+    threading.Timer(2.5, getattr(other, end)).start()  # whoever is not killed removes the file
     with lock.held(tmp_path / "run", wait=True):
         assert other.wait() != 0
+        assert lock.holder(tmp_path / "run") == f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def test_folders_that_stay_empty_do_not_stay(tmp_path):

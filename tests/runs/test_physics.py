@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hydra.errors import MissingConfigException
+from refusals import refused
 from smoke import rows
 
 from torchrl_mcp.envs import Heading
@@ -30,31 +30,21 @@ def composed(*overrides):
     return compose_run("method=scratch", "task=heading", "stage=transfer", "run_dir=never", *overrides)
 
 
-def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: experiment.train(composed("physics=warp", "autocast=false")), "physics=warp"),
+        (lambda: Heading("biped", 2, physics="warp"), "physics=warp"),
+        (lambda: Heading("biped", 2, physics="bullet"), "physics='bullet'"),
+        (lambda: Heading("biped", 2, device="meta"), "device=meta"),
+        (lambda: requirements.require_equipment(composed("physics=warp", "collector=processes")), "collector=local"),
+    ],
+    ids=["not installed", "not installed", "unknown", "no CPU", "workers on a device"],
+)
+def test_an_engine_that_cannot_simulate_is_refused(tmp_path, monkeypatch, call, name):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(engines, "find_spec", lambda name: None)
-    run = tmp_path / "run"
-    with pytest.raises(ValueError, match=r"pip install 'torchrl-mcp\[warp\]', or choose physics=mujoco"):
-        experiment.train(composed("physics=warp", "autocast=false", f"run_dir={run}"))
-    assert not run.exists()
-    with pytest.raises(ValueError, match="physics=warp needs MuJoCo Warp"):
-        Heading("biped", 2, physics="warp")
-
-
-def test_an_engine_that_does_not_exist_is_refused():
-    with pytest.raises(MissingConfigException, match="Could not find 'physics/bullet'"):
-        composed("physics=bullet")
-    with pytest.raises(ValueError, match="physics='bullet' is unknown: pass mujoco or warp"):
-        Heading("biped", 2, physics="bullet")
-
-
-def test_mujocos_threads_simulate_on_the_cpu_alone():
-    with pytest.raises(ValueError, match="MuJoCo's threads simulate on the CPU"):
-        Heading("biped", 2, device="meta")
-
-
-def test_workers_do_not_simulate_on_a_device():
-    with pytest.raises(ValueError, match=r"all environments at once.*pass collector=local"):
-        requirements.require_equipment(composed("physics=warp", "collector=processes"))
+    refused(call, name, untouched=tmp_path)
 
 
 @pytest.mark.parametrize(

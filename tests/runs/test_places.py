@@ -68,12 +68,6 @@ def test_a_longer_run_goes_on_from_another_folder_after_a_move_as_one_that_was_p
     assert learnt(root / "moved") == learnt(root / "planned")
 
 
-def test_a_run_does_not_become_shorter_than_it_is(root, command):
-    outcome = command("train", "resume=a/run", "training.total_frames=64", cwd=root)
-    assert outcome.returncode
-    assert "has taken 128 steps" in outcome.stderr
-
-
 def test_motions_are_found_from_every_folder_and_missed_by_the_name_of_their_setting(tmp_path, command):
     (tmp_path / "a/clips").mkdir(parents=True)
     trex_corpus()[0].save(tmp_path / "a/clips/walk.npz")

@@ -8,6 +8,7 @@ import zipfile
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 from torchrl import torchrl_logger
 
@@ -124,7 +125,7 @@ def test_where_a_tensor_finds_no_room_the_system_s_error_names_the_checkpoint_an
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
-        with pytest.raises(OSError, match=r"cannot write .*checkpoint-000000000200.torchrl: .*File too large"):
+        with pytest.raises(OSError, match=r"checkpoint-000000000200\.torchrl"):
             save(run_checkpoint(parts), checkpoints, step=200, config=config)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -146,7 +147,7 @@ def test_where_the_system_has_no_more_files_an_intact_checkpoint_is_not_called_d
     ):
         try:
             resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
-            with pytest.raises(OSError, match="Too many open files"):
+            with pytest.raises(OSError, match="open files"):
                 ask(path)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
@@ -155,8 +156,7 @@ def test_where_the_system_has_no_more_files_an_intact_checkpoint_is_not_called_d
 
 @pytest.mark.parametrize("place", [".", "absent", "temporary"])
 def test_where_there_is_no_checkpoint_that_is_said(saved_run, place):
-    with pytest.raises(ValueError, match="neither a checkpoint file nor a run folder"):
-        find(saved_run.parent / place)
+    refused(lambda: find(saved_run.parent / place), str(saved_run.parent / place))
 
 
 def test_a_checkpoint_tells_the_configuration_that_wrote_it(saved_run, config):
