@@ -1,11 +1,11 @@
 // What a policy observes, for one simulation: observations.py, and the goals of envs/tasks, with the same names.
 // Positions are in metres and angles in radians; quaternions are (w, x, y, z).
 
-export const LINEAR_DISTANCE = 0.25; // transport.py
+export const LINEAR_DISTANCE = 0.25; // places.py
 export const ARRIVAL_DISTANCE = 0.3; // rewards.py
 const WALK_AHEAD = 1.5; // seconds; this and what follows: waypoints.py
 const [STRIDE, PUSH, SHARE, BEHIND, ASIDE, STEP] = [1.0, 0.5, 0.1, 0.7, Math.PI / 4, 0.5];
-const [SUCCESS_DISTANCE, SUCCESS_REACH] = [0.5, 2.0]; // transport.py
+const [SUCCESS_DISTANCE, SUCCESS_REACH] = [0.5, 2.0]; // rewards.py
 
 /** Horizontal angle of a body's x axis from the world's. */
 export const heading = ([w, x, y, z]) => Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z));
