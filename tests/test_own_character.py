@@ -161,7 +161,7 @@ def test_files_are_utf_8_in_any_locale(command, tmp_path, monkeypatch):
         ("--name on", "'on' is a word of Python or YAML: choose another name"),
         ("--name class", "'class' is a word of Python or YAML"),
         ("--sides left", "'left' is not of the form RIGHT:LEFT, such as FR_:FL_"),
-        ("--pose crouch", "--pose crouch is no keyframe of the file: its keyframes are 0, 1"),
+        ("--pose crouch", "--pose crouch is not a keyframe of the file: its keyframes are 0, 1"),
         ("--gain ankle=5", "--gain ankle=5 matches no joint: they are lwaist, pelvis, right_thigh"),
         ("--root head", "there is no body head for the root: name one of torso, lwaist"),
     ],

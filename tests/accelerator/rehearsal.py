@@ -24,13 +24,14 @@ from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import LocalSource
 from torchrl_mcp.training.trainer import Trainer
+from torchrl_mcp.training.update import Update
 
 SETTINGS = [
     *("preset=smoke", "logger=none", "num_threads=1", "progress_bar=false", "character=biped"),
     *("training.frames_per_batch=32", "training.minibatch_size=16", "training.num_epochs=3"),
 ]
 """Eight steps of four environments and six gradient steps per iteration."""
-SECTIONS = {"collect": (LocalSource, "collect"), "update": (Trainer, "_update"), "save": (Trainer, "save")}
+SECTIONS = {"collect": (LocalSource, "collect"), "update": (Update, "learn"), "save": (Trainer, "save")}
 
 
 def main():

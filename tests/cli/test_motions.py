@@ -359,9 +359,9 @@ WRONG = {
     "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
-    "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' is no duration: pass more than 0 seconds"),
-    "endless": (["render", "stand.txt", "--seconds", "inf"], "'inf' is no duration"),
-    "no frames": (["inspect", "stand.txt", "--skip", "-3"], "--skip: '-3' is no whole number of at least 0"),
+    "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' must be a duration: pass more than 0 seconds"),
+    "endless": (["render", "stand.txt", "--seconds", "inf"], "'inf' must be a duration"),
+    "no frames": (["inspect", "stand.txt", "--skip", "-3"], "--skip: '-3' must be a whole number of at least 0"),
     "no Python": (
         ["inspect", "stand.txt", "--module", "broken_code"],
         r"broken_code, which is no Python: .*broken_code\.py, line 1",

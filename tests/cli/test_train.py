@@ -72,7 +72,7 @@ def test_hydras_own_settings_can_be_printed_with_all_references_resolved(monkeyp
 def test_an_unknown_setting_is_answered_with_the_nearest_that_exist(argument, meant):
     (line,) = suggestions([argument])
     key, _ = argument.split("=")
-    assert line.startswith(f"'{key}' is no setting")
+    assert line.startswith(f"'{key}' is not a setting")
     assert line.split("the nearest are: ")[1].split(", ")[0] == meant
 
 
@@ -92,7 +92,7 @@ def test_an_argument_that_no_file_names_is_answered_with_a_plus(arguments, writt
 
 def test_a_setting_like_no_other_is_answered_with_how_to_list_all():
     (line,) = suggestions(["qqqqqqqq=1"])
-    assert line == "'qqqqqqqq' is no setting of this method: torchrl-mcp-train --cfg job prints all"
+    assert line == "'qqqqqqqq' is not a setting of this method: torchrl-mcp-train --cfg job prints all"
 
 
 @pytest.mark.parametrize(
@@ -126,8 +126,8 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
     ("arguments", "answer"),
     [
         (["method=mpc"], "there is no method=mpc: did you mean mcp? The choices are finetune, hierarchical, "),
-        (["mcp"], "mcp is no setting: write NAME=VALUE without spaces"),
-        (["method", "=", "mcp"], "method = mcp is no setting: write NAME=VALUE without spaces"),
+        (["mcp"], "mcp is not a setting: write NAME=VALUE without spaces"),
+        (["method", "=", "mcp"], "method = mcp is not a setting: write NAME=VALUE without spaces"),
         (["--config-dir", "nowhere", "method=mcp"], "nowhere"),
         (["--config-dir", "nowhere", "benchmark=smoke"], "there is no folder nowhere: correct --config-dir"),
         (["seed=1,2,3"], "seed=1,2,3 has several values: add --multirun"),
@@ -137,7 +137,7 @@ def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
         (["run_dir=~/größe"], f"""without quotes: write 'run_dir="{Path.home()}/größe"'"""),
         (["resume=a=b"], """without quotes: write 'resume="a=b"'"""),
         (["sead=3"], "the nearest are: seed"),
-        (["method=mcp", "latent_dim=3"], "is no setting of this method"),
+        (["method=mcp", "latent_dim=3"], "is not a setting of this method"),
     ],
 )
 def test_what_hydra_cannot_compose_is_answered_in_a_line(command, tmp_path, arguments, answer):

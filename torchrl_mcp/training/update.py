@@ -152,7 +152,10 @@ class Update:
         Raises:
             FloatingPointError: If a number is not finite.
         """
-        samples = self._samples(batch)
+        return self.learn(self._samples(batch), warming_up=warming_up)
+
+    def learn(self, samples: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
+        """Learn from samples ``(B,)`` with advantages, as from trajectories."""
         orders = [torch.randperm(samples.shape[0], device=samples.device) for _ in range(self.settings.num_epochs)]
         minibatches = [index for order in orders for index in order.split(self.settings.minibatch_size)]
         learning = {name: partial(self._learn, name, samples, minibatches) for name in self.objective.optimizers}

@@ -209,8 +209,8 @@ WRONG = {
         r"has 1 numbers after the root's 7, and the joints take 22: .*--joints",
     ),
     "ragged": ("0,0,1,1,0,0,0\n0,0,1,1\n", r"csv:2: has 4 numbers, and the first line has 7: correct it"),
-    "a word": ("0,0,1,1,0,0,0\n0,0,1,1,0,0,x\n", r"csv:2: 'x' is no number: correct it"),
-    "decimal commas": ("0,0;0,0;1,0;1,0;0,0;0,0;0,0\n" * 3, r"csv:2: '0,0' is no number: correct it"),
+    "a word": ("0,0,1,1,0,0,0\n0,0,1,1,0,0,x\n", r"csv:2: 'x' is not a number: correct it"),
+    "decimal commas": ("0,0;0,0;1,0;1,0;0,0;0,0;0,0\n" * 3, r"csv:2: '0,0' is not a number: correct it"),
     "not finite": ("0,0,1,1,0,0,0\n0,0,1,nan,0,0,0\n", r"csv:2: 'nan' is not finite: correct it"),
     "no rotation": (
         f"{STANDING}\n" * 2 + STANDING.replace(",1.0,", ",0.0,", 1),

@@ -184,10 +184,10 @@ WRONG = {
     "a number": ({"poses": np.float64(1.0)}, "poses has shape"),
     "other length": ({"trans": np.zeros((4, 3))}, "has 5 poses and 4 positions in trans: they should be equally many"),
     "flat trans": ({"trans": np.zeros((5, 2))}, r"its array trans has shape \(5, 2\), and should have \(T, 3\)"),
-    "not finite": ({"poses": np.full((5, 72), np.nan)}, "its array poses holds what is no finite number"),
-    "words": ({"trans": np.full((5, 3), "a")}, "its array trans holds what is no finite number"),
+    "not finite": ({"poses": np.full((5, 72), np.nan)}, "its array poses holds a value that is not a finite number"),
+    "words": ({"trans": np.full((5, 3), "a")}, "its array trans holds a value that is not a finite number"),
     "no rate": ({"fps": None}, r"has no frame rate .*: give it \(--fps\)"),
-    "rate zero": ({"fps": 0.0}, "its fps is no positive number"),
+    "rate zero": ({"fps": 0.0}, "its fps must be a positive number"),
     "no trans": ({"trans": None}, "its array trans cannot be read"),
     "pickled": ({"trans": np.array([{}] * 5, dtype=object)}, "its array trans cannot be read"),
     "lies": (
