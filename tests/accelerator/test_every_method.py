@@ -20,8 +20,10 @@ WAITS_PER_UPDATE = 5
 """Means of the actor's gradient steps, of its last epoch's and of the critic's, the policy's spread, and dead units."""
 WAITS_OF_CRITIC = 3
 """The same where the critic alone learns."""
-WAITS_BESIDES = 25
-"""What else an iteration records or selects by a mask, and what a run begins with."""
+WAITS_BESIDES = 35
+"""What else an iteration records or selects by a mask, and what a run begins with: 17 to 26, by how many episodes and
+options end, which differs between processors. A wait in each of the 32 steps would add as many.
+"""
 GRADIENT_STEPS = 6
 
 

@@ -152,10 +152,15 @@ class Update:
         Raises:
             FloatingPointError: If a number is not finite.
         """
-        return self.learn(self._samples(batch), warming_up=warming_up)
+        with self.precision():
+            samples = self.objective.advantages(batch)
+        return self.learn(samples, warming_up=warming_up)
 
     def learn(self, samples: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
-        """Learn from samples ``(B,)`` with advantages, as from trajectories."""
+        """Learn from samples with advantages, of any batch shape, as from trajectories."""
+        actor = self.agent.actor
+        keys = ["observation", "goal", actor.sampled, actor.log_prob, *actor.stored]
+        samples = samples.select(*keys, *self.objective.advantages.out_keys).flatten()
         orders = [torch.randperm(samples.shape[0], device=samples.device) for _ in range(self.settings.num_epochs)]
         minibatches = [index for order in orders for index in order.split(self.settings.minibatch_size)]
         learning = {name: partial(self._learn, name, samples, minibatches) for name in self.objective.optimizers}
@@ -172,14 +177,6 @@ class Update:
         if "actor" in self.objective.optimizers:
             metrics["loss/actor_step_size"] = self.objective.optimizers["actor"].param_groups[0]["lr"]
         return metrics | self._network_metrics(samples)
-
-    def _samples(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return the samples of trajectories, ``(B,)``, with the keys that the losses read."""
-        with self.precision():
-            samples = self.objective.advantages(batch)
-        actor = self.agent.actor
-        keys = ["observation", "goal", actor.sampled, actor.log_prob, *actor.stored]
-        return samples.select(*keys, *self.objective.advantages.out_keys).flatten()
 
     def _run(self, tasks: Mapping[str, Callable[[], list[TensorDictBase]]]) -> dict[str, list[TensorDictBase]]:
         """Return the reports of actor and critic, which share only the samples: on a CPU they learn in parallel."""
