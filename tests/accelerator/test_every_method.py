@@ -21,8 +21,9 @@ WAITS_PER_UPDATE = 5
 WAITS_OF_CRITIC = 3
 """The same where the critic alone learns."""
 WAITS_BESIDES = 35
-"""What else an iteration records or selects by a mask, and what a run begins with: up to 26 so far, by how many episodes and
-options end, which differs between processors. A wait in each of the 32 steps would add as many.
+"""What else an iteration records or selects by a mask, and what a run begins with: up to 26 so far.
+
+How many episodes and options end differs between processors. A wait in each of the 32 steps would add as many.
 """
 GRADIENT_STEPS = 6
 
