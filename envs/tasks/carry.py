@@ -151,7 +151,7 @@ class Carry(Transport):
         speed: float | None = None,
         place: tuple[float, float] | None = None,
     ) -> None:
-        """See :meth:`CharacterEnv.steer`: a box that was put down is taken again once the target moves."""
+        """See :meth:`.CharacterEnv.steer`: a box that was put down is taken again once the target moves."""
         if place is not None and tuple(self.target.next_position[0, :2].tolist()) != place:
             self.offer(0)
         super().steer(place=place)

@@ -135,7 +135,7 @@ class Heading(PDCharacterEnv):
 
     @property
     def steerable(self) -> Steerable:
-        """See :attr:`CharacterEnv.steerable`: the direction, and the speed if it has a range."""
+        """See :attr:`.CharacterEnv.steerable`: the direction, and the speed if it has a range."""
         return Steerable(
             direction=float(self.episode["direction"][0]),
             speed=float(self.episode["speed"][0]),
@@ -149,7 +149,7 @@ class Heading(PDCharacterEnv):
         speed: float | None = None,
         place: tuple[float, float] | None = None,
     ) -> None:
-        """See :meth:`CharacterEnv.steer`: the user has direction and speed in hand, or neither."""
+        """See :meth:`.CharacterEnv.steer`: the user has direction and speed in hand, or neither."""
         self._steered = direction is not None or speed is not None
         if direction is not None:
             self.episode["direction"][0] = direction

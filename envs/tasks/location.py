@@ -153,7 +153,7 @@ class Location(PDCharacterEnv):
 
     @property
     def steerable(self) -> Steerable:
-        """See :attr:`CharacterEnv.steerable`: the place; a direction and a speed put it ahead of the character."""
+        """See :attr:`.CharacterEnv.steerable`: the place; a direction and a speed put it ahead of the character."""
         heading = float(self.heading(slice(1))[0])
         return Steerable(direction=heading, speed=self.speed, speeds=(0.0, self.speed), place=True)
 
@@ -164,7 +164,7 @@ class Location(PDCharacterEnv):
         speed: float | None = None,
         place: tuple[float, float] | None = None,
     ) -> None:
-        """See :meth:`CharacterEnv.steer`: in the user's hands, the place stays; let go, the task draws another."""
+        """See :meth:`.CharacterEnv.steer`: in the user's hands, the place stays; let go, the task draws another."""
         target = None if place is None else self.com.new_tensor(place)
         if direction is not None and speed:
             velocity = speed * unit_vector(self.com.new_tensor(direction))

@@ -32,7 +32,7 @@ class Transport(PDCharacterEnv):
     """A character brings an object to a target: the reward of appendix D, its variants, and what a return can reach.
 
     A subclass sets the class attributes below. Its constructor makes ``object`` and ``target`` with
-    :meth:`begin_with`, and ends with :meth:`make_specs`.
+    :meth:`begin_with`, and ends with :meth:`.CharacterEnv.make_specs`.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -220,7 +220,7 @@ class Transport(PDCharacterEnv):
 
     @property
     def steerable(self) -> Steerable:
-        """See :attr:`CharacterEnv.steerable`: the place of the target."""
+        """See :attr:`.CharacterEnv.steerable`: the place of the target."""
         return Steerable(place=True)
 
     def steer(
@@ -230,7 +230,7 @@ class Transport(PDCharacterEnv):
         speed: float | None = None,
         place: tuple[float, float] | None = None,
     ) -> None:
-        """See :meth:`CharacterEnv.steer`."""
+        """See :meth:`.CharacterEnv.steer`."""
         if place is not None:
             self.target.next_position[0, :2] = self.target.position.new_tensor(place)
 

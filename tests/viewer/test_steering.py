@@ -306,3 +306,17 @@ def test_a_reset_begins_a_new_episode():
     steering.reset()
     assert steering.player.began
     assert steering.player.data.time == 0.0
+
+
+@pytest.mark.parametrize(("weight", "held"), [(1.7, 1.0), (-0.2, 0.0), (0.3, 0.3)])
+def test_a_gate_is_held_within_its_range(walker, weight, held):
+    walker.pin(2, weight)
+    assert walker.player.pinned == {2: held}
+
+
+def test_without_a_speed_up_goes_to_the_last_primitive_and_down_to_the_first(walker):
+    for sign, alone in ((1, 7), (-1, 0)):
+        walker.player.pinned = {}
+        walker.step()
+        walker.up(sign)
+        assert walker.player.pinned == {number: float(number == alone) for number in range(8)}

@@ -67,8 +67,8 @@ def begun(start: Callable[[], Result]) -> Result:
     error = outcome.exception()
     if error is None or not isinstance(error, Exception) or isinstance(error, (OSError, ValueError)):
         return outcome.result()
-    if isinstance(error.__cause__, EOFError):  # a worker ended without a word
-        _require_alive(workers)
+    if isinstance(error.__cause__, EOFError):  # a worker ended without a word, perhaps before the first look
+        _require_alive(_started_beside(others))
     raise failure("a worker failed while it started", error) from error
 
 
