@@ -40,6 +40,21 @@ class Steerable:
     place: bool = False
 
 
+@dataclass(frozen=True)
+class UserGoal:
+    """A user's wishes for the goal of the first simulation; None leaves a quantity to the task.
+
+    Args:
+        direction: Target direction in radians from the world's x axis.
+        speed: Target speed in m/s.
+        place: Place of the target on the ground, x and y in metres.
+    """
+
+    direction: float | None = None
+    speed: float | None = None
+    place: tuple[float, float] | None = None
+
+
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
@@ -237,19 +252,11 @@ class CharacterEnv(EnvBase):
         """What viewers can set of the goal with :meth:`steer`: by default nothing."""
         return Steerable()
 
-    def steer(
-        self,
-        *,
-        direction: float | None = None,
-        speed: float | None = None,
-        place: tuple[float, float] | None = None,
-    ) -> None:
+    def steer(self, goal: UserGoal) -> None:
         """Set the goal of the first simulation as a user wants it, until the end of the next step.
 
         Args:
-            direction: Target direction in radians from the world's x axis, or None for the task's.
-            speed: Target speed in m/s, or None for the task's.
-            place: Place of the target on the ground, x and y in metres, or None for the task's.
+            goal: The user's wishes; without any, the task has its goal back.
         """
 
     @property

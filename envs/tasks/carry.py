@@ -8,6 +8,7 @@ import mujoco
 import torch
 from torch import Tensor
 
+from torchrl_mcp.envs.base import UserGoal
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.rotations import about_z, heading, inverse, multiply, rotate
 from torchrl_mcp.envs.tasks.objects import SceneObject, Weld, horizontal_extent, sensors
@@ -144,17 +145,11 @@ class Carry(Transport):
         box.next_velocity[index] = 0.0
         self.episode["taken"][index] = 0
 
-    def steer(
-        self,
-        *,
-        direction: float | None = None,
-        speed: float | None = None,
-        place: tuple[float, float] | None = None,
-    ) -> None:
+    def steer(self, goal: UserGoal) -> None:
         """See :meth:`.CharacterEnv.steer`: a box that was put down is taken again once the target moves."""
-        if place is not None and tuple(self.target.next_position[0, :2].tolist()) != place:
+        if goal.place is not None and tuple(self.target.next_position[0, :2].tolist()) != goal.place:
             self.offer(0)
-        super().steer(place=place)
+        super().steer(goal)
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and where it sees tables and box."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import interval, not_negative, positive
-from torchrl_mcp.envs.base import Steerable
+from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
@@ -125,12 +125,14 @@ class Heading(PDCharacterEnv):
     def update_goal(self) -> None:
         """Let the direction wander, and change some of the speeds."""
         turns = self._uniform(self.num_envs, -self.max_turn, self.max_turn)
-        turns[: self._steered] = 0.0
+        if self._steered:
+            turns[0] = 0.0
         self.episode["direction"] += turns
         if self.changes_speed:
             speed, another = self.episode["speed"], self._uniform(self.num_envs, *self.speeds)
             changes = self._uniform(self.num_envs, 0.0, 1.0) < self.change_probability
-            changes[: self._steered] = False
+            if self._steered:
+                changes[0] = False
             speed.copy_(torch.where(changes, another, speed))
 
     @property
@@ -142,19 +144,13 @@ class Heading(PDCharacterEnv):
             speeds=self.speeds if self.changes_speed else None,
         )
 
-    def steer(
-        self,
-        *,
-        direction: float | None = None,
-        speed: float | None = None,
-        place: tuple[float, float] | None = None,
-    ) -> None:
+    def steer(self, goal: UserGoal) -> None:
         """See :meth:`.CharacterEnv.steer`: the user has direction and speed in hand, or neither."""
-        self._steered = direction is not None or speed is not None
-        if direction is not None:
-            self.episode["direction"][0] = direction
-        if speed is not None:
-            self.episode["speed"][0] = speed
+        self._steered = goal.direction is not None or goal.speed is not None
+        if goal.direction is not None:
+            self.episode["direction"][0] = goal.direction
+        if goal.speed is not None:
+            self.episode["speed"][0] = goal.speed
 
     def reach(self) -> Reach | None:
         """See :meth:`CharacterEnv.reach`; None with a range of speeds, which are drawn as the episode goes on.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import not_negative, positive
-from torchrl_mcp.envs.base import Steerable
+from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.observations import UNITS
@@ -157,17 +157,11 @@ class Location(PDCharacterEnv):
         heading = float(self.heading(slice(1))[0])
         return Steerable(direction=heading, speed=self.speed, speeds=(0.0, self.speed), place=True)
 
-    def steer(
-        self,
-        *,
-        direction: float | None = None,
-        speed: float | None = None,
-        place: tuple[float, float] | None = None,
-    ) -> None:
+    def steer(self, goal: UserGoal) -> None:
         """See :meth:`.CharacterEnv.steer`: in the user's hands, the place stays; let go, the task draws another."""
-        target = None if place is None else self.com.new_tensor(place)
-        if direction is not None and speed:
-            velocity = speed * unit_vector(self.com.new_tensor(direction))
+        target = None if goal.place is None else self.com.new_tensor(goal.place)
+        if goal.direction is not None and goal.speed:
+            velocity = goal.speed * unit_vector(self.com.new_tensor(goal.direction))
             target = place_ahead(self.com[0, :2], velocity)
         if target is not None:
             self.episode["target"][0] = target

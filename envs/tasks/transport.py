@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.arguments import positive
-from torchrl_mcp.envs.base import Steerable
+from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import Reach, transport_reach
 from torchrl_mcp.envs.observations import SIZES, UNITS
@@ -223,16 +223,10 @@ class Transport(PDCharacterEnv):
         """See :attr:`.CharacterEnv.steerable`: the place of the target."""
         return Steerable(place=True)
 
-    def steer(
-        self,
-        *,
-        direction: float | None = None,
-        speed: float | None = None,
-        place: tuple[float, float] | None = None,
-    ) -> None:
+    def steer(self, goal: UserGoal) -> None:
         """See :meth:`.CharacterEnv.steer`."""
-        if place is not None:
-            self.target.next_position[0, :2] = self.target.position.new_tensor(place)
+        if goal.place is not None:
+            self.target.next_position[0, :2] = self.target.position.new_tensor(goal.place)
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""

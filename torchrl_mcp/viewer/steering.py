@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from torchrl_mcp.envs.base import UserGoal
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
@@ -171,8 +172,9 @@ class Steering:
     def step(self) -> None:
         """Let the policy act once, with the user's goal and gates."""
         env = self.player.env
-        env.steer(direction=self.direction, speed=self.speed, place=self.place)
-        if any(goal is not None for goal in (self.direction, self.speed, self.place)):
+        goal = UserGoal(self.direction, self.speed, self.place)
+        env.steer(goal)
+        if goal != UserGoal():
             env.max_episode_steps = sys.maxsize
         self.player.step()
 
