@@ -47,7 +47,8 @@ class Page(SphinxDirective):
 
 def written(command: list[str], folder: Path) -> bool:
     """Return whether the site has the page of a command, after trying to write it."""
-    about, newest = folder / "page.json", max(file.stat().st_mtime for file in SOURCES.rglob("*"))
+    about = folder / "page.json"
+    newest = max(file.stat().st_mtime for file in SOURCES.rglob("*"))
     same = about.exists() and json.loads(about.read_text())["command"] == shlex.join(command)
     if same and about.stat().st_mtime > newest:
         return True

@@ -38,7 +38,8 @@ class Soles(NamedTuple):
 
     def standing_height(self) -> float:
         """Median height in metres of the soles that stand, over the flattest third of them; NaN without any."""
-        heights, tilts = self.heights[self.stands], self.tilts[self.stands]
+        heights = self.heights[self.stands]
+        tilts = self.tilts[self.stands]
         if not len(heights):
             return math.nan
         return float(heights[tilts <= tilts.quantile(1 / 3)].median())
@@ -57,7 +58,8 @@ def soles(clip: MotionClip, *, sinking: float = STILL) -> Soles:
     Raises:
         ValueError: If a foot has no shape that collides.
     """
-    states, feet = body_states(clip.character, clip.qpos, clip.qvel), CHARACTERS[clip.character].feet
+    states = body_states(clip.character, clip.qpos, clip.qvel)
+    feet = CHARACTERS[clip.character].feet
     points = [contact_points(clip.character, foot, states) for foot in feet]
     heights = torch.stack([found.positions[..., 2].amin(-1) for found in points], dim=-1)
     velocities = torch.stack([found.velocities.mean(1) for found in points], dim=1)
@@ -70,7 +72,8 @@ def soles(clip: MotionClip, *, sinking: float = STILL) -> Soles:
 
 def _tilts(clip: MotionClip, orientations: Tensor) -> Tensor:
     """Angle between each foot and its orientation in the rest pose, but for the heading, shape ``(T, F)``."""
-    names, model = body_names(clip.character), character_model(clip.character)
+    names = body_names(clip.character)
+    model = character_model(clip.character)
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet]
     rest = body_states(clip.character, torch.from_numpy(model.qpos0)[None], torch.zeros(1, model.nv).double())
     up = rest.orientations.new_tensor([0.0, 0.0, 1.0])

@@ -235,8 +235,8 @@ class Transport(PDCharacterEnv):
 
     def arrows(self, index: int) -> list[Arrow]:
         """Arrows from above the character to the object, and from above the object to the target."""
-        com, place, target = (part[index] for part in (self.com, self.object.position, self.target.position))
-        return [pointer(com, place), pointer(place, target)]
+        place = self.object.position[index]
+        return [pointer(self.com[index], place), pointer(place, self.target.position[index])]
 
 
 def goal_layout(sizes: Mapping[str, int], waypoint: bool) -> dict[str, slice]:

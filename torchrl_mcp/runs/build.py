@@ -199,7 +199,8 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
         begin_after(logger, trainer.progress.frames)
     if cfg.get("record_interval") is None:
         return loggers
-    actor, make_film_env = trainer.agent.actor, partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
+    actor = trainer.agent.actor
+    make_film_env = partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
     num_options = actor.num_options if isinstance(actor, OptionActor) else 0
     recorder = instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=num_options)
     return [*loggers, recorder]

@@ -265,11 +265,11 @@ def _resolved(name: str) -> Any:
 
 def _require_own(module: str, origin: str) -> None:
     """Check that an imported module is the one in the working directory, if there is one, and none of Python's."""
-    own = next((file for file in (Path(f"{module}.py"), Path(module, "__init__.py")) if file.exists()), None)
+    file = next((path for path in (Path(f"{module}.py"), Path(module, "__init__.py")) if path.exists()), None)
     imported = getattr(sys.modules[module], "__file__", None)
-    if own is None and module not in sys.stdlib_module_names:
+    if file is None and module not in sys.stdlib_module_names:
         return
-    if own is None or imported is None or not own.samefile(imported):
+    if file is None or imported is None or not file.samefile(imported):
         raise ValueError(
             f"{origin}, but Python has another module {module}{f', {imported}' if imported else ''}: rename yours"
         )

@@ -43,7 +43,9 @@ def guarded() -> Iterator[None]:
             "--viewer window, or install mujoco 3.17 or 4.0"
         )
     level = web_server.logger.level
-    bind, serve, banner = (getattr(module, name) for module, name in names)
+    bind = web_server.bind_public_socket
+    serve = web_server.serve
+    banner = web_viewer._print_url_banner
     web_server.logger.setLevel(logging.WARNING)
     web_server.bind_public_socket = lambda _, port=0: bind(HERE, port)
     web_server.serve = _checking(serve)

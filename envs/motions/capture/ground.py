@@ -56,7 +56,8 @@ def grounded(character: str, qpos: Tensor, times: Tensor, *, loop: bool = False)
     shift = torch.cat([qpos[0, :2], torch.zeros(1, dtype=torch.float64)])
     qpos = torch.cat([qpos[:, :3] - shift, qpos[:, 3:]], dim=-1)
     clip = _evenly(character, qpos, times)
-    note, level = "", None if loop else _level(soles(clip, sinking=SINKING))
+    note = ""
+    level = None if loop else _level(soles(clip, sinking=SINKING))
     if level is not None:
         note = f"feet stand at heights up to {100 * float(level.max() - level.min()):.0f} cm apart, which were levelled"
         even = torch.arange(len(level), dtype=torch.float64) / clip.fps

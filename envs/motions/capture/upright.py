@@ -75,7 +75,8 @@ def upright(
     """
     if up is not None and up not in VERTICALS:
         raise ValueError(f"up={up!r} is not an axis: pass one of {', '.join(VERTICALS)}")
-    moving, body = _parts(joints, frames), _body(_parts(joints, rest))
+    moving = _parts(joints, frames)
+    body = _body(_parts(joints, rest))
     if body is None:
         named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"
         raise source.error(
@@ -83,7 +84,8 @@ def upright(
             f"{_remedy(moving, skip)}say with a map which joints are which (--map)"
         )
     nearest = _nearest(body)
-    start, chosen = VERTICALS[nearest], up or nearest
+    start = VERTICALS[nearest]
+    chosen = up or nearest
     if rest_frame is None:
         chosen = up or _vertical(source, moving, source.up or nearest)
         if body @ start < CLOSELY and _closely(moving, VERTICALS[chosen]):

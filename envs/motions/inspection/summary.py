@@ -78,7 +78,8 @@ def foot_slide(clip: MotionClip) -> float:
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet[:2]]
     if len(feet) < 2:
         return math.nan
-    velocities, places = bodies.linear_velocities[..., :2], bodies.positions[..., :2]
+    velocities = bodies.linear_velocities[..., :2]
+    places = bodies.positions[..., :2]
     first, second = feet
     swinging = (velocities[:, first] - velocities[:, second]).norm(dim=-1) > SWINGING
     turning = bodies.angular_velocities[:, 0, 2].abs()
@@ -97,7 +98,8 @@ def gliding(clip: MotionClip) -> float:
     While it does neither, something should rest on the ground, whatever the motion: feet, knees, hands, or the back. If
     the rotations of a recording are read in the wrong order, so that the body tumbles, everything glides at 1 m/s.
     """
-    model, states = character_model(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
+    model = character_model(clip.character)
+    states = body_states(clip.character, clip.qpos, clip.qvel)
     masses = torch.from_numpy(model.body_mass[1:] / model.body_mass[1:].sum())
     (acceleration,) = torch.gradient(states.linear_velocities[..., 2] @ masses, spacing=1 / clip.fps)
     carried = (acceleration > -GRAVITY / 2) & (states.linear_velocities[:, 0, :2].norm(dim=-1) < RUNNING)

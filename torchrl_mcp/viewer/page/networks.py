@@ -34,7 +34,9 @@ class Stage(nn.Module):
         self, module: TensorDictModuleBase, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
         super().__init__()
-        self.module, self.in_keys, self.out_keys = module, list(in_keys), list(out_keys)
+        self.module = module
+        self.in_keys = list(in_keys)
+        self.out_keys = list(out_keys)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Return the results ``(N, ...)`` for arguments ``(N, ...)``."""
