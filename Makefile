@@ -42,9 +42,10 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(PYTEST) -n 2 --dist loadfile -m "not slow"
 
-# The tests whose outcome is chaotic, as on processors that are not at hand: a quarter of an hour.
+# The tests whose outcome is chaotic, as on processors that are not at hand: half an hour.
+PERTURBATIONS ?= 20
 test-processors: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/support/processors.py
+	OMP_NUM_THREADS=1 $(BIN)/python tests/support/processors.py --perturbations $(PERTURBATIONS)
 
 # Two hundred faults, one at a time: half an hour.
 test-faults: $(STAMP)
