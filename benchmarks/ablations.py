@@ -58,7 +58,7 @@ def variants(found: Sequence[Cell]) -> list[dict[str, Any]]:
 
 def chosen(cell: Cell, count: int = len(VARIED)) -> tuple[Any, ...]:
     """Return the first ``count`` choices that are ablated."""
-    return tuple(cell.choices[name] for name in VARIED[:count])
+    return tuple(cell.choices.get(name) for name in VARIED[:count])
 
 
 def order(variant: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
 import csv
 import json
 import tarfile
-from functools import partial
+from functools import cache, partial
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,7 +9,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from torchrl_mcp.report.results import find_runs
+from torchrl_mcp.runs.configuration import compose_run
 
+CONF = Path(__file__).parents[2] / "conf"
 TABLE_2 = Path(__file__).parents[2] / "benchmarks/results/table2"
 MACHINE = {"processor": "Abacus", "cores": 2, "device": "cpu", "python": "3.11", "torch": "2.13", "mujoco": "3.17"}
 
@@ -30,6 +32,15 @@ PAPERS_MCP = {
     "transfer__keep": ["primitives", "observation_normaliser"],
     "transfer__freeze": ["primitives", "observation_normaliser"],
 }
+
+
+@cache
+def declared(method):
+    """Title and own settings of a method, nothing of a method that the library lacks."""
+    if not (CONF / "method" / f"{method}.yaml").exists():
+        return {}
+    content = OmegaConf.to_container(compose_run(f"method={method}").method, resolve=True)
+    return {name: content[name] for name in ("title", "standard")}
 
 
 def write(
@@ -57,6 +68,7 @@ def write(
     cfg = OmegaConf.create({"seed": seed, "run_dir": str(folder), "training": {"total_frames": total_frames}})
     for group, choice in {"task": task, "character": character, "stage": stage, "method": method}.items():
         cfg[group] = {"name": choice}
+    cfg.method = {**cfg.method, **declared(method)}
     for key, value in settings.items():
         OmegaConf.update(cfg, key.replace("__", "."), value)
     OmegaConf.save(cfg, folder / "config.yaml")

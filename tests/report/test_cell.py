@@ -144,7 +144,7 @@ def test_what_training_used_and_the_evaluation_did_not_is_remarked(write_run):
     (remark,) = (remark for remark in practised.remarks if remark.startswith("trained with"))
     assert remark == (
         "trained with curriculum=practised: curriculum.initial_states.rest=0.2, "
-        "curriculum.initial_states.motions=0.8, curriculum.mixture=[{'weight': 2}]"
+        "curriculum.initial_states.motions=0.8, curriculum.mixture.0.weight=2"
     )
 
 

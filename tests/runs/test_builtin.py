@@ -151,3 +151,12 @@ def test_what_comes_with_the_library_follows_its_motions(path):
     results = policies.evaluation(path, episodes=16, seed=0, max_episode_steps=30)
     assert results["deterministic"]["terminated"] <= 0.25  # of 24 seeds 0.013 on average, 0.06 at most
     assert results["deterministic"]["metrics"]["tracking_error"] < 0.1  # 0.043 with a standard deviation of 0.006
+
+
+@pytest.mark.parametrize("character", ["biped", "humanoid", "trex"])
+def test_a_published_gate_is_restored_with_the_curriculum_of_its_training_and_evaluated_without(character):
+    cfg, _, env = policies.restore(builtin.builtin("mcp", character, "heading"), num_envs=2, seed=0)
+    assert cfg.evaluation.environment.curriculum is None
+    assert env.curriculum.initial_states["motions"] > 0
+    assert env.curriculum.random_first_length
+    assert env.curriculum.reward_weights is None

@@ -12,7 +12,6 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl_mcp.commands.suggestions import answer
 from torchrl_mcp.commands.task_settings import task_settings
 from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import build, configuration, policies
 from torchrl_mcp.runs.build import Agent
@@ -30,9 +29,8 @@ def play(arguments: argparse.Namespace) -> None:
         show(*_agent(arguments), 0, arguments)
         return
     agent, env = _restored(arguments)
-    options = agent.actor.num_options if isinstance(agent.actor, OptionActor) else 0
     watch = Watch(Path(arguments.checkpoint), agent.parts) if arguments.watch else None
-    show(agent.actor.policy, env, options, arguments, before_step=watch)
+    show(agent.actor.policy, env, agent.actor.num_options, arguments, before_step=watch)
 
 
 def show(

@@ -9,10 +9,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.report.comparison import reported
 from torchrl_mcp.report.paper import CHARACTERS
-from torchrl_mcp.report.results import Run, leaves
+from torchrl_mcp.report.results import Run
 from torchrl_mcp.runs import policies, quoting, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
 from torchrl_mcp.runs.identity import CONDUCT, is_among
+from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.runs.trust import trust_options
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.run_folder import CONFIG, MODES, PROVENANCE, read_json

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.methods.options import OptionActor, option_diagnostics
+from torchrl_mcp.methods.options import option_diagnostics
 from torchrl_mcp.modules import gate_diagnostics
 
 DIAGNOSED = ("gates", "option", "begins")
@@ -32,7 +32,7 @@ def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
     found = {}
     if "gates" in actor.stored:
         found["gates"] = gate_diagnostics(samples["gates"])
-    if isinstance(actor, OptionActor) and "begins" in actor.stored:
+    if actor.num_options and "begins" in actor.stored:
         found["options"] = option_diagnostics(samples["option"], samples["begins"], actor.num_options)
     named = {f"{group}/{name}": value for group, values in found.items() for name, value in values.items()}
     if not named:

@@ -60,7 +60,7 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy in parts.
+    """A policy in parts: all that collection, losses, diagnostics, films and exports ask of a method.
 
     Attributes:
         policy: Module that collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
@@ -68,6 +68,8 @@ class Actor:
         stored: Keys, beside the environment's own, that a sample must hold for the loss and the diagnostics.
         drawn: Keys of ``stored`` with random values, rather than values computed from ``observation`` and ``goal``.
         sampled: Key of the random variable whose log-probability the policy gradient takes.
+        num_options: Number of options of which one acts at a time, 0 for a policy without options. The samples of a
+            policy with options hold the ``option`` that acted.
     """
 
     policy: TensorDictModuleBase
@@ -75,6 +77,7 @@ class Actor:
     stored: tuple[NestedKey, ...] = ()
     sampled: str = "action"
     drawn: tuple[NestedKey, ...] = ()
+    num_options: int = 0
 
     @property
     def log_prob(self) -> str:

@@ -7,8 +7,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from torchrl_mcp.methods.actor import GOAL, STATE, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
-from torchrl_mcp.methods.options import Choice, OptionActor, RandomSequence, WhereBeginning, keep_option
+from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
+from torchrl_mcp.methods.options import Choice, RandomSequence, WhereBeginning, keep_option
 
 
 def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: int) -> nn.ModuleDict:
@@ -43,7 +43,7 @@ def gated_parts(
     return parts
 
 
-def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> OptionActor:
+def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> Actor:
     """Let the primitive act whose index the environment sends as ``option``; all primitives train side by side.
 
     Args:
@@ -52,7 +52,7 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
         frozen: Names of the parts that do not change in training.
     """
     policy = ProbabilisticTensorDictSequential(normalise_inputs(parts), *_acting(parts))
-    return OptionActor(policy, policy, stored=("option",), num_options=num_options)
+    return Actor(policy, policy, stored=("option",), num_options=num_options)
 
 
 def gated_actor(
@@ -62,7 +62,7 @@ def gated_actor(
     steps_per_choice: int,
     action_noise: bool = True,
     frozen: Collection[str] = (),
-) -> OptionActor:
+) -> Actor:
     r"""Draw a primitive from the gate :math:`w(s, g)` every ``steps_per_choice`` steps, and let it act in between.
 
     Args:
@@ -94,7 +94,7 @@ def gated_actor(
         TensorDictModule(keep_option, in_keys=["begins", "option", "held_option"], out_keys=["option"]),
         *(_acting(parts) if action_noise else _playing_means(parts)),
     )
-    return OptionActor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
+    return Actor(policy, trained, stored=("option", "begins"), sampled="option", num_options=num_options)
 
 
 def random_sequence(

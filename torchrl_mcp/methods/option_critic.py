@@ -31,6 +31,7 @@ from torchrl_mcp.methods.actor import (
     GOAL,
     PRIMITIVES,
     STATE,
+    Actor,
     Explorer,
     Sizes,
     input_normalisers,
@@ -39,7 +40,6 @@ from torchrl_mcp.methods.actor import (
 )
 from torchrl_mcp.methods.options import (
     EpsilonGreedy,
-    OptionActor,
     RandomSequence,
     WhereBeginning,
     keep_option,
@@ -87,7 +87,7 @@ def option_critic_parts(
 
 def option_critic_actor(
     parts: nn.ModuleDict, *, num_options: int, epsilon: float, frozen: Collection[str] = ()
-) -> OptionActor:
+) -> Actor:
     r"""Choose the option of highest value when none is held or the held one ends, and let it act.
 
     Terminations stay random in deterministic interaction, because no threshold on :math:`\beta` would keep the rates at
@@ -119,7 +119,7 @@ def option_critic_actor(
             TensorDictModule(termination, in_keys=["terminations", "option"], out_keys=["termination"]),
         )
     trained = ProbabilisticTensorDictSequential(normalise_inputs(parts), *arriving, *_acting(parts))
-    return OptionActor(policy, trained, stored=("option", "begins"), num_options=num_options)
+    return Actor(policy, trained, stored=("option", "begins"), num_options=num_options)
 
 
 def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:

@@ -2,26 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NoReturn, Self
 
 import torch
 from torch import Size, Tensor, nn
 from torch.distributions import Categorical, Distribution
 
-from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
-
-
-@dataclass(frozen=True)
-class OptionActor(Actor):
-    """An actor whose samples hold the ``option`` that acted.
-
-    Attributes:
-        num_options: Number of options, ``K``.
-    """
-
-    num_options: int = 0
 
 
 class SeparateOptions(nn.Module):

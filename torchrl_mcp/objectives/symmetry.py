@@ -8,7 +8,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.objectives.actor_loss import ActorLoss
 
 
@@ -109,7 +108,7 @@ class SymmetryLoss(ActorLoss):
 
 
 def _require_actions(actor: Actor) -> None:
-    if isinstance(actor, OptionActor) or actor.sampled != "action":
+    if actor.num_options or actor.sampled != "action":
         raise ValueError(
             "symmetry mirrors the actions of one policy: options and gate weights have no mirror images. Pass "
             "symmetry=none, or exploration=action and a method without options"

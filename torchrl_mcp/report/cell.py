@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from torchrl_mcp.evaluation.statistics import Estimate, deviation, mean, shared_means
 from torchrl_mcp.report.paper import TABLE_2, Reported
-from torchrl_mcp.report.results import Run, leaves
+from torchrl_mcp.report.results import Run
+from torchrl_mcp.runs.settings import leaves
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -222,7 +223,7 @@ def _protocol(run: Run) -> str:
 
 def _changed(run: Run) -> dict[str, Any]:
     """Return the settings of the task in a run's evaluation that its configuration has otherwise."""
-    held = leaves(run.evaluation.get("environment") or {}, "evaluation.environment")
+    held = leaves(run.evaluation.get("environment") or {}, "evaluation.environment.")
     changed = {name: value for name, value in held if run.settings.get(name, value) != value}
     return {name.removeprefix("evaluation.environment."): value for name, value in changed.items()}
 

@@ -24,9 +24,9 @@ class Ablation:
 
 
 def choices(run: Run) -> dict[str, Any]:
-    """Return settings that the paper or the command line names, and the method's standard settings.
+    """Return settings that the paper or the command line names, and the method's own, which its file declares.
 
-    Settings that a method lacks are None.
+    The method declares its own as ``method.standard``. Settings that a method lacks are None.
     """
     settings = run.settings
     kept = settings.get("transfer.keep", ()) if run.stage == "transfer" else ()
@@ -34,9 +34,7 @@ def choices(run: Run) -> dict[str, Any]:
     named = {
         "preset": run.preset,
         "total_frames": run.total_frames,
-        "num_primitives": settings.get("num_primitives"),
-        "num_options": settings.get("num_options"),
-        "latent_dim": settings.get("latent_dim"),
+        **{name: settings[name] for name in run.standard if name in settings},
         "trained": trained if "primitives" in kept else None,
         "gate": "kept" if "gating" in kept else None,
         "mixer": settings.get("mixer.name"),
@@ -81,7 +79,7 @@ def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
         others = _frozen({k: v for k, v in {**cell.choices, **cell.settings}.items() if k != setting})
         return cell.place, cell.stage, cell.method, others
 
-    groups = grouped((cell for cell in cells if cell.choices[setting] is not None), rest).values()
+    groups = grouped((cell for cell in cells if cell.choices.get(setting) is not None), rest).values()
     return [
         Ablation(setting, sorted(group, key=lambda cell: cell.choices[setting])) for group in groups if len(group) > 1
     ]

@@ -5,15 +5,10 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from omegaconf import OmegaConf
-
-from torchrl_mcp.runs import configuration
-from torchrl_mcp.runs.earlier import translated
+from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.runs.trust import read_config
 from torchrl_mcp.training.run_folder import (
     CHECKPOINTS,
@@ -212,7 +207,7 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
 def read_run(folder: Path) -> Run | Damaged:
     """Read a run folder; errors in its files are returned, not raised."""
     try:
-        settings = dict(leaves(translated(read_config(folder / CONFIG))))
+        settings = dict(leaves(read_config(folder / CONFIG)))
     except FileNotFoundError:
         return Damaged(folder, f"has no {CONFIG}")
     except (OSError, ValueError) as error:
@@ -221,8 +216,6 @@ def read_run(folder: Path) -> Run | Damaged:
         return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
     if (total := settings["training.total_frames"]) < 1:
         return Damaged(folder, f"{CONFIG} has training.total_frames={total}: it must be at least 1")
-    if "method.title" not in settings:  # an older run, without the method's title and standard settings
-        settings = dict(leaves(_about(settings["method.name"]), "method")) | settings
     contents: dict[str, Any] = {"settings": settings}
     faults = []
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
@@ -245,15 +238,6 @@ def _run_folders(path: Path) -> Iterator[Path]:
             yield Path(folder)
             subfolders[:] = [name for name in subfolders if name != CHECKPOINTS]
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
-
-
-def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of a nested dictionary with their dotted names."""
-    if not isinstance(value, dict):
-        yield name, value
-        return
-    for key, inner in value.items():
-        yield from leaves(inner, f"{name}.{key}" if name else str(key))
 
 
 def _progress(folder: Path) -> dict[str, Any]:
@@ -317,13 +301,3 @@ def _line(error: Exception) -> str:
     """The first line of an error's message."""
     message = str(error).partition("\n")[0] or type(error).__name__
     return f"it lacks {message}" if isinstance(error, KeyError) else message
-
-
-@cache
-def _about(method: str) -> dict[str, Any]:
-    """Return the group ``method`` of the library's configuration for a method, empty for unknown methods."""
-    known = files("torchrl_mcp.conf").joinpath("method").iterdir()
-    if f"{method}.yaml" not in {file.name for file in known}:
-        return {}
-    cfg = configuration.compose_run(f"method={method}")
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg.method, resolve=True))

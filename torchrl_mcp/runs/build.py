@@ -16,12 +16,10 @@ from torchrl.envs import Compose
 
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.methods.actor import Sizes
-from torchrl_mcp.methods.options import OptionActor
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.publish import load_kept
 from torchrl_mcp.runs.requirements import require_arguments, require_entry, require_environment, require_files
 from torchrl_mcp.training import checkpoint
@@ -114,7 +112,7 @@ def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        saved = OmegaConf.create(translated(checkpoint.saved_config(pretrained)))
+        saved = OmegaConf.create(checkpoint.saved_config(pretrained))
         numbers = [name for name, number in cfg.method.standard.items() if isinstance(number, int)]
         names = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
         theirs, ours = ({name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg))
@@ -201,8 +199,7 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
         return loggers
     actor = trainer.agent.actor
     make_film_env = partial(make_env, cfg, num_envs=1, seed=cfg.evaluation.seed)
-    num_options = actor.num_options if isinstance(actor, OptionActor) else 0
-    recorder = instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=num_options)
+    recorder = instantiate(cfg.recorder)(folder, actor.policy, make_film_env, loggers, num_options=actor.num_options)
     return [*loggers, recorder]
 
 

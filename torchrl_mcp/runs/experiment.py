@@ -8,7 +8,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import build, lock, places, records
 from torchrl_mcp.runs.configuration import Plan, initial_networks, planned
-from torchrl_mcp.runs.earlier import require_resumable
 from torchrl_mcp.runs.policies import evaluation
 from torchrl_mcp.runs.records import is_complete
 from torchrl_mcp.runs.requirements import require_all
@@ -111,7 +110,6 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
     if is_complete(folder) and is_complete(folder, cfg):
         records.store(folder, config)
         return folder
-    require_resumable(config)
     records.require_same_character(folder, config)
     cfg.device = device or cfg.device
     require_all(cfg)

@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +10,8 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig, OmegaConf
+
+from torchrl_mcp.runs.settings import leaves
 
 FOLDER = Path(str(files("torchrl_mcp.conf")))
 
@@ -40,7 +42,8 @@ def require_used(cfg: DictConfig) -> None:
     config: Any = OmegaConf.to_container(cfg)
     groups = {group: config[group] for group in GROUPS if isinstance(config[group], Mapping)}
     names = [*config, *(f"{group}.{key}" for group, settings in groups.items() for key in settings)]
-    own = set(_words(config)) - known()
+    references = [str(value) for _, value in leaves(config) if "${" in str(value)]
+    own = set(re.findall(r"[\w-]+", " ".join(references))) - known()
     unused = [name for name in names if name not in known() and name.rpartition(".")[2] not in own]
     remedies = {name: _remedy(name) for name in unused}
     if lines := [f"nothing uses the setting {name}: {remedy}" for name, remedy in remedies.items() if remedy]:
@@ -61,15 +64,6 @@ def known() -> frozenset[str]:
 
 def _content(path: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-
-
-def _words(value: Any) -> Iterator[str]:
-    """Yield all words of texts with references, which may be of any form."""
-    if isinstance(value, Mapping | list):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _words(item)
-    elif isinstance(value, str) and "${" in value:
-        yield from re.findall(r"[\w-]+", value)
 
 
 def _remedy(name: str) -> str | None:

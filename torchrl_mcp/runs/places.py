@@ -6,13 +6,14 @@ identify a run, but the content of what lies outside does.
 
 import hashlib
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 from zipfile import ZipFile, is_zipfile
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.runs.settings import leaves, replaced
 from torchrl_mcp.training.run_folder import find_all
 
 HERE = "."
@@ -28,27 +29,19 @@ BUILTIN = "builtin"
 """Value of ``pretrained``, or its beginning, for the networks that come with the library."""
 
 
-def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+def settings(config: Any) -> Iterator[tuple[str, str]]:
     """Yield the name and value of every setting that is a file or folder.
 
     >>> list(settings({"seed": 0, "pretrained": "runs/a", "motions": {"_target_": FOLDER_LIBRARY, "path": "clips"}}))
     [('pretrained', 'runs/a'), ('motions.path', 'clips')]
     """
-    if isinstance(config, list):
-        for item in config:
-            yield from settings(item, prefix)
-    elif isinstance(config, Mapping):
-        for key, value in config.items():
-            if not isinstance(value, str):
-                yield from settings(value, f"{prefix}{key}.")
-            elif _is_place(key, value, config):
-                yield f"{prefix}{key}", value
-
-
-def _is_place(key: str, value: str, config: Mapping[str, Any]) -> bool:
-    if key == PRETRAINED:
-        return value.partition(":")[0] != BUILTIN
-    return key == "path" and config.get("_target_") == FOLDER_LIBRARY
+    values = dict(leaves(config))
+    for name, value in values.items():
+        group, _, key = name.rpartition(".")
+        from_library = key == "path" and values.get(f"{group}._target_") == FOLDER_LIBRARY
+        from_training = key == PRETRAINED and str(value).partition(":")[0] != BUILTIN
+        if isinstance(value, str) and (from_library or from_training):
+            yield name, value
 
 
 def outside(config: Mapping[str, Any]) -> dict[str, str]:
@@ -75,33 +68,23 @@ def moved(config: Mapping[str, Any], moves: Mapping[str, str]) -> dict[str, Any]
         config: The configuration.
         moves: New values by the old ones.
     """
-    names = dict(settings(config))
-    return _mapped(config, lambda name, value: moves.get(value, value) if name in names else value)
+    return replaced(config, {name: moves.get(value, value) for name, value in settings(config)})
 
 
 def located(config: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a stored configuration with references to ``run_dir`` in place of :data:`HERE`.
-
-    Args:
-        config: The stored configuration. Those of older versions have the folder where the run began.
-        folder: The run folder.
-    """
-    here = str(config.get("run_dir", HERE))
-
-    def locate(name: str, value: str) -> str:
-        inside = value == here or value.startswith(f"{here}/")
-        # The name of a folder, as in older versions, may also be that of a task.
-        if inside and (here == HERE or "/" in here or name.startswith("logger.")):
-            return f"${{run_dir}}{value.removeprefix(here)}"
-        return value
-
-    return _mapped(config, locate) | {"run_dir": str(folder), "run_root": str(folder)}
+    """Return a stored configuration with references to ``run_dir``, which is ``folder``, in place of :data:`HERE`."""
+    texts = [(name, value) for name, value in leaves(config) if isinstance(value, str)]
+    inside = {
+        name: f"${{run_dir}}{value.removeprefix(HERE)}"
+        for name, value in texts
+        if value == HERE or value.startswith(f"{HERE}/")
+    }
+    return replaced(config, inside) | {"run_dir": str(folder), "run_root": str(folder)}
 
 
-def placeless(config: Any) -> Any:
+def placeless(config: Mapping[str, Any]) -> Any:
     """Return a part of a configuration without the values of settings that are files or folders."""
-    names = dict(settings(config))
-    return _mapped(config, lambda name, value: "" if name in names else value)
+    return replaced(config, {name: "" for name, _ in settings(config)})
 
 
 def digests(config: Mapping[str, Any]) -> dict[str, str]:
@@ -136,12 +119,3 @@ def _networks(file: Path) -> list[tuple[str, int]]:
     with ZipFile(file) as archive:
         members = [(member.filename.partition("-part-")[2], member.CRC) for member in archive.infolist()]
     return sorted(pair for pair in members if pair[0].endswith(".memmap"))
-
-
-def _mapped(value: Any, change: Callable[[str, str], str], name: str = "") -> Any:
-    """Return a tree of settings with every text changed by a function of its name and value."""
-    if isinstance(value, Mapping):
-        return {key: _mapped(inner, change, f"{name}.{key}" if name else str(key)) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_mapped(item, change, name) for item in value]
-    return change(name, value) if isinstance(value, str) else value

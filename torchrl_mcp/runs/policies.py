@@ -16,7 +16,6 @@ from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import places, requirements
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.run_folder import MODES
@@ -34,7 +33,7 @@ def policy_config(path: Path) -> DictConfig:
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
     requirements.require_known(config, file)
-    return OmegaConf.create(translated(config))
+    return OmegaConf.create(config)
 
 
 def restore(

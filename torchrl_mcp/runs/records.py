@@ -7,7 +7,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import places
-from torchrl_mcp.runs.earlier import translated
 from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import continuation, provenance
@@ -35,7 +34,7 @@ def located(config: Mapping[str, Any], folder: Path) -> DictConfig:
         ValueError: If it is of another version of the library.
     """
     require_known(config, folder / CONFIG)
-    return OmegaConf.create(places.located(translated(config), folder))
+    return OmegaConf.create(places.located(config, folder))
 
 
 def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
@@ -166,7 +165,7 @@ def require_same_run(cfg: DictConfig, path: Path) -> None:
     """
     held, wanted = (
         {**config, "training": {**config["training"], "total_frames": None}}
-        for config in (translated(checkpoint.saved_config(path)), places.stored(cfg))
+        for config in (checkpoint.saved_config(path), places.stored(cfg))
     )
     if changed := differences(held, wanted, CONDUCT | PLACES | {"evaluation", "budget"}):
         raise ValueError(

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import FOLDER
+from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.runs.trust import require_trusted, targets
 
 SHARED = {name: name for name in ("seed", "device", "physics", "num_threads")} | {"num_envs": "training.num_envs"}
@@ -69,33 +70,35 @@ def require_environment(cfg: DictConfig) -> None:
             f"task.{cfg.stage.name} of task={task} has no settings of its own: give task.pretrain.NAME=VALUE, which "
             "holds in both stages"
         )
-    environment, *_ = [_resolved(name) for name in names]
+    for name in names:
+        _resolved(name)
+    environment = _resolved(cfg.task[cfg.stage.name]["_target_"])
     able: tuple[str, ...] = getattr(environment, "characters", tuple)()
     if able and character not in able:
         known = " or ".join(able)
         raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
 
 
-def require_callable(config: Any, path: str = "") -> None:
+def require_callable(config: Mapping[str, Any]) -> None:
     """Check that the library's classes and functions in a configuration take the arguments that it gives them.
 
     Args:
         config: The configuration, without references.
-        path: Its name, the beginning of those in an error.
 
     Raises:
         ValueError: If one does not, with the nearest that it takes.
     """
-    name = config.get("_target_") if isinstance(config, Mapping) else None
-    if isinstance(name, str) and name.startswith("torchrl_mcp.") and _exists(name):
+    settings = list(leaves(config))
+    for setting, name in settings:
+        group = setting.removesuffix("_target_")
+        if group == setting or not str(name).startswith("torchrl_mcp.") or not _exists(name):
+            continue
+        given = [inner.removeprefix(group).partition(".")[0] for inner, _ in settings if inner.startswith(group)]
         taken = arguments(name)
-        unknown = [str(key) for key in config if key not in taken and not str(key).startswith("_")]
+        unknown = [key for key in given if key not in taken and not key.startswith("_")]
         if unknown and not any(map(_is_open, taken.values())):
             near = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
-            raise ValueError(f"{path}.{unknown[0]} is not an argument of {name}; the nearest are: {', '.join(near)}")
-    items = config.items() if isinstance(config, Mapping) else enumerate(config) if isinstance(config, list) else ()
-    for key, value in items:
-        require_callable(value, f"{path}.{key}" if path else str(key))
+            raise ValueError(f"{group}{unknown[0]} is not an argument of {name}; the nearest are: {', '.join(near)}")
 
 
 def require_files(cfg: DictConfig, task: DictConfig) -> None:

@@ -20,6 +20,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mcp.runs import quoting
+from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.training.run_folder import CONFIG
 
 LARGEST = 2**20
@@ -50,17 +51,12 @@ def trusting(names: Iterable[str]) -> Iterator[None]:
 
 def targets(config: Any) -> Iterator[str]:
     """Yield the names of all classes, functions and modules in a configuration, from the top."""
-    if isinstance(config, Mapping):
-        if isinstance(module := config.get("module"), str):
-            yield module
-        if isinstance(name := config.get("_target_"), str):
-            yield name
-            if name == GET_CLASS:
-                yield str(config.get("path"))
-    elif not isinstance(config, list):
-        return
-    for item in config.values() if isinstance(config, Mapping) else config:
-        yield from targets(item)
+    settings = list(leaves(config))
+    classes = {name.rpartition(".")[0] for name, value in settings if value == GET_CLASS}
+    for name, value in settings:
+        group, _, key = name.rpartition(".")
+        if isinstance(value, str) and (key in ("module", "_target_") or (key == "path" and group in classes)):
+            yield value
 
 
 @cache
@@ -87,7 +83,7 @@ def require_trusted(config: Mapping[str, Any], source: Path) -> None:
             f"{source} would run {name}, which no configuration of this library names. If you know the file and that "
             f"code, pass --trust {name.rpartition('.')[0] or name}"
         )
-    if any("${" in text for text in _texts(config)):
+    if any("${" in f"{name}{value}" for name, value in leaves(config)):
         raise ValueError(f"{source} holds an interpolation, which training never writes: it was changed, do not use it")
 
 
@@ -149,15 +145,3 @@ def _may_be_built(name: str) -> bool:
 
 def _is_in(name: str, modules: Collection[str]) -> bool:
     return any(name.startswith(f"{module}.") for module in modules)
-
-
-def _texts(config: Any) -> Iterator[str]:
-    if isinstance(config, str):
-        yield config
-    elif isinstance(config, Mapping):
-        for key, value in config.items():
-            yield str(key)
-            yield from _texts(value)
-    elif isinstance(config, list):
-        for item in config:
-            yield from _texts(item)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from torchrl_mcp.envs.pd_character import CONES
 from torchrl_mcp.envs.tasks.imitation import CLIP_ENDS, SWITCHES
 from torchrl_mcp.envs.tasks.transport import POSITIONS
+from torchrl_mcp.runs.settings import leaves
 
 
 class Rule(NamedTuple):
@@ -166,7 +167,7 @@ def wrong_values(config: Mapping[str, Any]) -> Iterator[str]:
     Args:
         config: Settings, in groups or not.
     """
-    for path, value in _settings(config):
+    for path, value in leaves(config):
         if value == "???":
             yield f"{path} is needed: pass {path}=..."
         elif (rule := _rule(path)) and not rule.allows(value):
@@ -186,18 +187,6 @@ def _step_size_beyond(actor: float, schedule: Mapping[str, Any]) -> Iterator[str
 def _rule(path: str) -> Rule | None:
     parts = path.split(".")
     return next((RULES[end] for start in range(len(parts)) if (end := ".".join(parts[start:])) in RULES), None)
-
-
-def _settings(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every setting that is not a group, with its path; a list of groups counts as groups."""
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _settings(inner, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
-        for item in value:
-            yield from _settings(item, path)
-    else:
-        yield path, value
 
 
 def _escapes(folder: str, root: str) -> bool:

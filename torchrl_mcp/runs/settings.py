@@ -1,0 +1,49 @@
+"""The settings of a configuration by their dotted names."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of every setting that is not a group of settings.
+
+    A list of groups is a group, in which the settings have their place as name. Any other list is a value.
+
+    Args:
+        config: A configuration, or a list of them.
+        prefix: Beginning of the names.
+
+    >>> list(leaves({"seed": 0, "task": {"near": [1, 2], "mixture": [{"weight": 3}]}}))
+    [('seed', 0), ('task.near', [1, 2]), ('task.mixture.0.weight', 3)]
+    """
+    for key, value in _items(config):
+        if _is_group(value):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def replaced(config: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
+    """Return a configuration with other values of some settings.
+
+    Args:
+        config: A configuration, or a list of them.
+        values: New values by the dotted names of their settings.
+        prefix: Beginning of the names.
+
+    >>> replaced({"seed": 0, "task": {"path": "clips"}}, {"task.path": "walks"})
+    {'seed': 0, 'task': {'path': 'walks'}}
+    """
+    changed = {
+        key: replaced(value, values, f"{prefix}{key}.") if _is_group(value) else values.get(f"{prefix}{key}", value)
+        for key, value in _items(config)
+    }
+    return changed if isinstance(config, Mapping) else list(changed.values())
+
+
+def _is_group(value: Any) -> bool:
+    return isinstance(value, Mapping) or (isinstance(value, list) and any(isinstance(item, Mapping) for item in value))
+
+
+def _items(group: Any) -> Iterator[tuple[Any, Any]]:
+    return iter(group.items() if isinstance(group, Mapping) else enumerate(group))
