@@ -6,33 +6,30 @@ import pytest
 import yaml
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs.identity import CONDUCT, LEVELS, PLACES, TRANSFER_ONLY, UNLEARNT, UNNAMED, differences, is_among
+from torchrl_mcp.runs.identity import SAME_RUN, SETTINGS, TRANSFER_ONLY, UNLEARNT, differences, is_among
 
 TRAIN = yaml.safe_load((Path(conf.__file__).parent / "train.yaml").read_text())
 GROUPS = {name for group in TRAIN["defaults"] if isinstance(group, dict) for name in group}
 
 
 def test_every_level_of_a_run_folder_is_in_its_path():
-    for setting in LEVELS:
+    for setting in ("task", "character", "stage", "method", "seed"):
         assert f"${{{setting}" in TRAIN["run_dir"].replace(".name", "")
 
 
-@pytest.mark.parametrize(
-    "settings", [UNNAMED, UNLEARNT - {"task.evaluation", "task.curriculum"}], ids=["unnamed", "unlearnt"]
-)
-def test_every_setting_that_is_named_exists(settings):
-    for name in settings:
-        first, _, rest = name.partition(".")
-        assert name in GROUPS or first in TRAIN, name
-        assert not rest or rest in TRAIN[first], name
+@pytest.mark.parametrize("name", [name for name in SETTINGS if not name.startswith(("task.", "budget."))])
+def test_every_setting_in_the_table_exists(name):
+    first, _, rest = name.partition(".")
+    assert name in GROUPS or first in TRAIN
+    assert not rest or rest in TRAIN[first]
 
 
 def test_a_run_goes_on_with_another_conduct_but_with_no_other_setting():
-    held = dict.fromkeys([*CONDUCT, *PLACES, "autocast", "seed", "training"], 0)
+    held = dict.fromkeys([*SAME_RUN, "pretrained", "autocast", "seed", "training"], 0)
     assert differences(held, held) == []
     for name in held:
         found = differences(held, {**held, name: 1})
-        assert found == ([] if name in CONDUCT | {"run_dir", "run_root"} else [name])
+        assert found == ([] if name in SAME_RUN else [name])
 
 
 def test_networks_elsewhere_make_no_other_run_but_those_of_the_library_do():

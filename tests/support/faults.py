@@ -484,8 +484,8 @@ FAULTS = {
     ],
     "torchrl_mcp/runs/records.py": [
         (
-            "if changed := differences(held, wanted, CONDUCT",
-            "if changed := differences(held, held, CONDUCT",
+            "if changed := differences(held, wanted, SAME_RUN",
+            "if changed := differences(held, held, SAME_RUN",
             "runs/test_faults.py::test_a_run_whose_files_do_not_fit_is_not_resumed",
         ),
         (

@@ -12,14 +12,11 @@ from torchrl_mcp.report.paper import CHARACTERS
 from torchrl_mcp.report.results import Run
 from torchrl_mcp.runs import policies, quoting, records
 from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
-from torchrl_mcp.runs.identity import CONDUCT, is_among
+from torchrl_mcp.runs.identity import SAME_RUN, is_among
 from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.runs.trust import trust_options
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.run_folder import CONFIG, MODES, PROVENANCE, read_json
-
-PLACES = ("run_dir=", "run_root=", "resume=")
-"""Prefixes of arguments that only concern the machine of the run."""
 
 
 def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) -> None:
@@ -104,8 +101,7 @@ def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -
 
 def command(words: Sequence[str]) -> str:
     """Return the command that started a run, without folders of the machine and settings that make no other run."""
-    kept = (word for word in words if not word.startswith(PLACES))
-    return shlex.join(word for word in kept if not is_among(word.partition("=")[0], CONDUCT))
+    return shlex.join(word for word in words if not is_among(word.partition("=")[0], SAME_RUN))
 
 
 def _contents(path: Path, cfg: DictConfig) -> str:

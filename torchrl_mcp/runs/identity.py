@@ -7,48 +7,57 @@ import hashlib
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torchrl_mcp.runs.places import BUILTIN, digest, placeless
 
-CONDUCT = frozenset(
-    {
-        *("checkpoint_interval", "collector", "device", "keep_checkpoints", "logger"),
-        *("num_threads", "progress_bar", "record_interval", "recorder", "resume", "torch_threads"),
-    }
-)
-"""Settings of how a run is executed: they make no other run. A resumed run keeps its own, except for ``device``."""
 
-PLACES = frozenset({"pretrained", "run_dir", "run_root"})
-"""Settings of where a run is stored, and where its transferred parts come from.
+class Setting(NamedTuple):
+    """What a setting says about a run. It holds for all settings below it.
 
-They make no other run, but the content of ``pretrained`` does: see :mod:`torchrl_mcp.runs.places`.
-"""
+    Attributes:
+        identifies: Runs that differ in it are different runs, so a resumed run keeps it.
+        named: It is in the name of the run folder.
+        learnt: It affects what is learned: results of runs that differ in it are not averaged.
+        pretraining: Pre-training uses it. If it does not, pre-training ignores or refuses it.
+    """
 
-LEVELS = ("task", "character", "stage", "method", "seed")
-"""Settings that are a level each of the path of a run folder."""
+    identifies: bool = True
+    named: bool = True
+    learnt: bool = True
+    pretraining: bool = True
 
-UNNAMED = CONDUCT | PLACES | {*LEVELS, "autocast", "evaluation.episodes", "evaluation.seed"}
-"""Settings that are not in the name of a run folder, for the resolver ``unnamed`` of ``conf/train.yaml``."""
 
-ENVIRONMENTS = frozenset(
-    {"benchmark", "evaluation", "imitation", "motions", "curriculum", "task.evaluation", "task.curriculum"}
-)
-"""Settings that do not affect training, or environments of some stages only; ``task`` holds those of the stage."""
+EXECUTION = Setting(identifies=False, named=False, learnt=False)
+"""How or where a run is executed."""
 
-UNLEARNT = CONDUCT | PLACES | ENVIRONMENTS | {"autocast", "seed"}
-"""Settings that are ignored when results are compared: runs that differ only in them are averaged."""
+SETTINGS = {
+    **dict.fromkeys(("checkpoint_interval", "collector", "device", "keep_checkpoints", "logger"), EXECUTION),
+    **dict.fromkeys(("num_threads", "progress_bar", "record_interval", "recorder", "resume"), EXECUTION),
+    **dict.fromkeys(("run_dir", "run_root", "torch_threads"), EXECUTION),
+    # A level each of the path of a run folder.
+    **dict.fromkeys(("task", "character", "stage", "method"), Setting(named=False)),
+    "seed": Setting(named=False, learnt=False),
+    # The folder's name and the run's record have the content of the networks, see :func:`folder_name`.
+    "pretrained": Setting(named=False, learnt=False, pretraining=False),
+    "autocast": Setting(named=False, learnt=False),
+    **dict.fromkeys(("evaluation.episodes", "evaluation.seed"), Setting(named=False, learnt=False)),
+    # Of no effect on training, or environments of some stages only: ``task`` holds those of the stage.
+    **dict.fromkeys(("benchmark", "evaluation", "imitation", "motions"), Setting(learnt=False)),
+    **dict.fromkeys(("task.evaluation", "task.curriculum"), Setting(learnt=False)),
+    "curriculum": Setting(learnt=False, pretraining=False),
+    **dict.fromkeys(("budget.scratch", "budget.transfer", "exploration"), Setting(pretraining=False)),
+    **dict.fromkeys(("goal_positions", "transfer", "waypoint"), Setting(pretraining=False)),
+}
+"""The settings that are not all of it: any other identifies a run, is in its name, is learned from, in both stages."""
+
+SAME_RUN = frozenset(name for name, setting in SETTINGS.items() if not setting.identifies)
+UNNAMED = frozenset(name for name, setting in SETTINGS.items() if not setting.named)
+UNLEARNT = frozenset(name for name, setting in SETTINGS.items() if not setting.learnt)
+TRANSFER_ONLY = frozenset(name for name, setting in SETTINGS.items() if not setting.pretraining)
 
 PRETRAINING = frozenset({"imitation", "motions"})
 """Settings of :data:`UNLEARNT` that a transfer learns from if it keeps networks: those of their pre-training."""
-
-TRANSFER_ONLY = frozenset(
-    {
-        *("budget.scratch", "budget.transfer", "curriculum", "exploration", "goal_positions"),
-        *("pretrained", "transfer", "waypoint"),
-    }
-)
-"""Settings that pre-training ignores or refuses."""
 
 LONGEST = 100
 """Most characters of a folder's name, below the 255 bytes of common file systems."""
@@ -66,9 +75,7 @@ def is_among(name: str, settings: Collection[str]) -> bool:
     return any(name == setting or name.startswith(f"{setting}.") for setting in settings)
 
 
-def differences(
-    held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = CONDUCT | {"run_dir", "run_root"}
-) -> list[str]:
+def differences(held: Mapping[str, Any], wanted: Mapping[str, Any], ignored: Collection[str] = SAME_RUN) -> list[str]:
     """Return the top-level settings in which two configurations differ, so that they are different runs.
 
     Paths of files and folders count as equal.

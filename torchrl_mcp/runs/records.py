@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import places
-from torchrl_mcp.runs.identity import CONDUCT, PLACES, differences
+from torchrl_mcp.runs.identity import SAME_RUN, differences
 from torchrl_mcp.runs.machine import machine
 from torchrl_mcp.runs.provenance import continuation, provenance
 from torchrl_mcp.runs.requirements import require_known
@@ -167,7 +167,7 @@ def require_same_run(cfg: DictConfig, path: Path) -> None:
         {**config, "training": {**config["training"], "total_frames": None}}
         for config in (checkpoint.saved_config(path), places.stored(cfg))
     )
-    if changed := differences(held, wanted, CONDUCT | PLACES | {"evaluation", "budget"}):
+    if changed := differences(held, wanted, SAME_RUN | {"pretrained", "evaluation", "budget"}):
         raise ValueError(
             f"{path} is not of this run: it differs from {CONFIG} in {', '.join(changed)}. Put this run's own "
             "checkpoint back, or remove the file to go on from the one before"
