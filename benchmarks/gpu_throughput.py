@@ -31,7 +31,7 @@ from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs import build, configuration, requirements
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.machine import machine
+from torchrl_mcp.runs.provenance import machine
 from torchrl_mcp.training.precision import choose
 
 RESULTS = Path(__file__).resolve().parent / "results" / "gpu_throughput.csv"

@@ -16,8 +16,7 @@ PACKAGES = ("tensordict", "gymnasium", "numpy", "stable-baselines3")
 
 def about() -> dict[str, Any]:
     """Return commit, date, description of the machine, and versions of installed packages."""
-    from torchrl_mcp.runs.machine import machine
-    from torchrl_mcp.runs.provenance import commit
+    from torchrl_mcp.runs.provenance import commit, machine
 
     versions = {}
     for package in PACKAGES:

@@ -6,7 +6,7 @@ from refusals import refused
 
 from torchrl_mcp.runs import requirements
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.runs.keys import require_used
+from torchrl_mcp.runs.validation import require_used
 
 METHODS = ("mcp", "moe", "scratch", "finetune", "hierarchical", "option_critic", "latent_space")
 

@@ -515,8 +515,6 @@ FAULTS = {
         ('if value == "???"', "if False", "runs/test_validation.py::test_a_missing_value_is_asked_for"),
         ("if not wrong and _escapes", "if False and _escapes", PLACE),
         ("if not isinstance(config.get(name), Mapping)]", "if False]", VALUE),
-    ],
-    "torchrl_mcp/runs/keys.py": [
         ("if lines := [f", "if False and [f", KEY),
         ('if name not in ("defaults", "hydra", *cfg)]', "if False]", KEY),
     ],

@@ -112,7 +112,7 @@ def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        saved = OmegaConf.create(checkpoint.saved_config(pretrained))
+        saved = OmegaConf.create(dict(checkpoint.saved_config(pretrained)))
         numbers = [name for name, number in cfg.method.standard.items() if isinstance(number, int)]
         names = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
         theirs, ours = ({name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg))

@@ -12,7 +12,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mcp.runs import places, validation
 from torchrl_mcp.runs.builtin import PREFIX, builtin, locate
-from torchrl_mcp.runs.keys import require_used
 from torchrl_mcp.training import checkpoint
 
 
@@ -44,10 +43,10 @@ def planned(cfg: DictConfig) -> Plan:
     """Return the plan of a run.
 
     Raises:
-        ValueError: As :func:`require_valid` and :func:`.keys.require_used`, or if there is no such pre-training.
+        ValueError: As :func:`require_valid` and :func:`.validation.require_used`, or if there is no such pre-training.
     """
     config = require_valid(cfg)
-    require_used(cfg)
+    validation.require_used(cfg)
     where = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
     cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _sizes(cfg, initial)))

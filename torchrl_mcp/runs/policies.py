@@ -33,7 +33,7 @@ def policy_config(path: Path) -> DictConfig:
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
     requirements.require_known(config, file)
-    return OmegaConf.create(config)
+    return OmegaConf.create(dict(config))
 
 
 def restore(

@@ -8,8 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.identity import SAME_RUN, differences
-from torchrl_mcp.runs.machine import machine
-from torchrl_mcp.runs.provenance import continuation, provenance
+from torchrl_mcp.runs.provenance import continuation, machine, provenance
 from torchrl_mcp.runs.requirements import require_known
 from torchrl_mcp.runs.trust import read_config, resuming
 from torchrl_mcp.runs.validation import wrong_values

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -33,7 +33,7 @@ def require_all(cfg: DictConfig) -> None:
         ValueError: As the functions below, of which the last checks that there are networks to transfer.
     """
     require_environment(cfg)
-    require_callable(OmegaConf.to_container(cfg, resolve=True))
+    require_callable(cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)))
     require_files(cfg, cfg.task[cfg.stage.name])
     require_equipment(cfg)
     for section, given in ((cfg.stage.name, SHARED), ("evaluation", EVALUATED)):
