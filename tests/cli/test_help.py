@@ -7,9 +7,10 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 from torchrl_mcp import __version__
-from torchrl_mcp.cli import train
+from torchrl_mcp.cli import main, train
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -97,3 +98,22 @@ def test_the_choices_of_help_are_those_that_hydra_has():
     assert set(train.GROUPS) <= known
     assert "mcp" in train.choices("method")
     assert "mcp" in train.parser().format_help()
+
+
+@pytest.mark.parametrize("name", [name.removeprefix("torchrl-mcp-") for name in COMMANDS if name != "torchrl-mcp"])
+def test_one_program_has_all_commands(name, monkeypatch, capsys):
+    outputs = []
+    for words in ([f"torchrl-mcp-{name}", "--help"], ["torchrl-mcp", name, "--help"]):
+        program = words[0]
+        monkeypatch.setattr(sys, "argv", words)
+        with pytest.raises(SystemExit) as end:
+            import_module(COMMANDS[program].partition(":")[0]).main()
+        assert not end.value.code
+        outputs.append(capsys.readouterr().out)
+    assert outputs[0] == outputs[1]
+    assert name in main.COMMANDS
+
+
+def test_a_word_that_is_no_command_is_answered_with_the_nearest(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp", "trian"])
+    refused(main.main, "train", error=SystemExit)
