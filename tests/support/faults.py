@@ -307,7 +307,7 @@ FAULTS = {
         ),
         ("limb(side, ARM), forward=1.0", "limb(side, ARM), forward=-1.0", "envs/motions/capture/retarget"),
     ],
-    "envs/motions/capture/importer.py": [
+    "envs/motions/capture/fit.py": [
         (
             "if misread > 0.5",
             "if False",

@@ -66,9 +66,7 @@ def parser() -> argparse.ArgumentParser:
     source.add_argument(
         "--map", action="append", default=[], metavar="PART=JOINT", help="joint of a part of the body; repeatable"
     )
-    source.add_argument(
-        "--skip", type=index, default=0, metavar="N", help="leave out the first N frames, such as a T-pose"
-    )
+    source.add_argument("--skip", type=index, metavar="N", help="leave out the first N frames, such as a T-pose")
     source.add_argument(
         "--rest-frame", type=index, metavar="N", help="frame, from 0, of a standing pose, if the rest pose is none"
     )

@@ -9,7 +9,8 @@ from zipfile import BadZipFile
 from torch import Tensor
 
 from torchrl_mcp.envs.motions.archive import Archive
-from torchrl_mcp.envs.motions.capture.importer import Import, imported
+from torchrl_mcp.envs.motions.capture.fit import Import
+from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
 from torchrl_mcp.envs.motions.capture.key_bodies import read_key_map
 from torchrl_mcp.envs.motions.errors import MotionFormatError
