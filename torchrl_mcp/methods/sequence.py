@@ -130,4 +130,4 @@ def _require_same(acts: Sequence[Act]) -> None:
         for name in ("observation_normaliser", "primitives"):
             first, other = acts[0].parts[name].state_dict(), act.parts[name].state_dict()
             if first.keys() != other.keys() or any(not torch.equal(first[key], other[key]) for key in first):
-                raise ValueError(f"the {name} of acts 0 and {number} differ: pass gates over the same primitives")
+                raise ValueError(f"act {number} must have the {name} of act 0: pass gates over the same primitives")
