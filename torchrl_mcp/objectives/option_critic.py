@@ -34,8 +34,8 @@ class OptionAdvantages:
     - The target of values is :math:`Q_\Omega(s_t, \omega_t) + A_t`.
     - The advantage of terminations is :math:`A_\Omega(s_{t+1}, \omega_t) + \xi`.
 
-    With :math:`\lambda = 0` these are the one-step estimates of Bacon et al. A terminated episode has the value 0 and no
-    option after its end. An episode that a time limit or the end of the batch cuts off is bootstrapped.
+    With :math:`\lambda = 0` these are the one-step estimates of Bacon et al. A terminated episode has the value 0 and
+    no option after its end. An episode that a time limit or the end of the batch cuts off is bootstrapped.
 
     Rewards are multiplied by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`, so that values have
     the size of a reward. The advantage of terminations and :math:`\xi` are in units of returns, which are
