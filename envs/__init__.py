@@ -1,4 +1,8 @@
-"""Simulated characters and tasks in MuJoCo, imported as ``torchrl_mcp.envs``."""
+"""Simulated characters and tasks in MuJoCo, imported as ``torchrl_mcp.envs``.
+
+Every environment holds N simulations. Its tensors have the batch shape ``(N,)``: ``observation`` ``(N, S)``, ``goal``
+``(N, G)``, ``action`` ``(N, A)`` and ``reward`` ``(N, 1)``.
+"""
 
 if __name__ != "torchrl_mcp.envs":
     raise ImportError(

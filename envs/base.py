@@ -1,4 +1,4 @@
-"""The base class of all environments: what happens in a step, in the order of :meth:`CharacterEnv._step`."""
+"""The base class of all environments. Read :meth:`CharacterEnv._step` for what happens in a step, in order."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ ALL = slice(None)
 
 @dataclass(frozen=True)
 class Steerable:
-    """What a user can set of a task's goal in the first simulation, and its current values.
+    """The parts of a task's goal that a user can set in the first simulation, and their current values.
 
     Args:
         direction: Current target direction in radians from the world's x axis; None if the task has none.
@@ -42,7 +42,7 @@ class Steerable:
 
 @dataclass(frozen=True)
 class UserGoal:
-    """A user's wishes for the goal of the first simulation; None leaves a quantity to the task.
+    """The goal that a user sets in the first simulation. A quantity that is None is left to the task.
 
     Args:
         direction: Target direction in radians from the world's x axis.
@@ -58,29 +58,32 @@ class UserGoal:
 class CharacterEnv(EnvBase):
     """N copies of a character with a task, simulated side by side in one process.
 
-    A task defines :meth:`initial_state`, :meth:`observe` and :meth:`reward`, and where it needs them
-    :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal`, :meth:`normalised_return` and
-    :meth:`steer`. This class owns stepping, specs, partial resets, seeding, time limit, snapshots and divergence. All
-    simulations step together: under TorchRL's mask ``_step`` they do as well, and it masks their outputs. The state of
-    a task beyond the physics, such as a goal, is kept in ``episode``, which snapshots include. A constructor ends with
-    :meth:`make_specs`.
+    **Division of labour.** A task defines :meth:`initial_state`, :meth:`observe` and :meth:`reward`. If necessary, it
+    also defines :meth:`after_step`, :meth:`terminated`, :meth:`truncated`, :meth:`update_goal`,
+    :meth:`normalised_return` and :meth:`steer`. Its constructor ends with :meth:`make_specs`. This class does the
+    rest: stepping, specs, partial resets, seeding, time limit, snapshots and divergence.
 
-    A simulation that diverges or gets a non-finite action ends only its own episode: it is ``terminated``, with reward
-    0 and the observation from before the step, and ``num_diverged`` counts it.
+    **State.** Variables of a task beyond the physics, such as a goal, are kept in ``episode``, which snapshots include.
+
+    **Stepping.** All simulations step together, even under TorchRL's mask ``_step``, which only masks their outputs.
+
+    **Divergence.** A simulation that diverges or gets a non-finite action ends only its own episode. It is
+    ``terminated``, with reward 0 and the observation from before the step, and ``num_diverged`` counts it.
 
     Args:
         model: Character and scene.
         num_envs: Number N of simulations.
         substeps: Physics steps per action.
         max_episode_steps: Actions until an episode is ``truncated``.
-        episode: Task state of one simulation at the beginning of an episode, by name; stored as ``(N, ...)``.
+        episode: Variables of the task in one simulation at the beginning of an episode, by name. They are stored as
+            ``(N, ...)``.
         outputs: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         model_fields: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
-        physics: The engine: ``"mujoco"``, threads on the CPU in float64, ``"warp"``, MuJoCo Warp in float32, or
+        physics: The engine: ``"mujoco"`` (threads on the CPU, in float64), ``"warp"`` (MuJoCo Warp, in float32), or
             another :data:`~torchrl_mcp.envs.physics.engines.Engine`.
-        device: Device of simulations, rewards and outputs; MuJoCo's threads need the CPU.
+        device: Device of simulations, rewards and outputs. With ``"mujoco"`` it must be the CPU.
         seed: Seed of ``generator``, or None to draw one.
-        num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on it.
+        num_threads: Threads of the physics; 0 takes one per processor. Results do not depend on this number.
         persistent: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         current: See :data:`~torchrl_mcp.envs.physics.engines.Engine`.
         dtype: Type of the outputs; rewards are computed in float64, physics in the type of the engine.
@@ -89,6 +92,18 @@ class CharacterEnv(EnvBase):
 
     Raises:
         ValueError: If an argument is out of range.
+
+    Example:
+        Every task has these methods, for example :class:`.Heading`.
+
+        >>> from torchrl_mcp.envs import Heading
+        >>> env = Heading("biped", num_envs=2, seed=0)
+        >>> env.observation_layout["root.linear_velocity"], env.goal_layout["direction"], env.control_timestep
+        (slice(8, 11, None), slice(0, 2, None), 0.0333)
+        >>> state = env.get_state()
+        >>> first, again = (env.reset(state, set_state=True)["observation"] for _ in range(2))
+        >>> first.equal(again)
+        True
     """
 
     scene: str = ""
@@ -134,7 +149,7 @@ class CharacterEnv(EnvBase):
             if value < least:
                 raise ValueError(f"{name}={value} is too small: pass at least {least}")
         if pin_memory and not torch.cuda.is_available():
-            raise ValueError("pin_memory=True speeds up copies to a CUDA device, and none is available: pass False")
+            raise ValueError("pin_memory=True needs a CUDA device, but none is available: pass False")
         super().__init__(device=torch.device(device), batch_size=[num_envs])
         self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
         self.control_timestep = substeps * model.opt.timestep
@@ -184,25 +199,25 @@ class CharacterEnv(EnvBase):
 
     @abstractmethod
     def reward(self) -> Tensor:
-        """Reward of the step just made, ``(N,)``, float64."""
+        """Reward of the last step, ``(N,)``, float64."""
 
     def after_step(self, diverged: Tensor) -> None:
-        """Change what a step calls for, right after it: a weld that closes, say, or measurements in ``episode``.
+        """Act right after a step: close a weld, for example, or store measurements in ``episode``.
 
         Args:
-            diverged: Simulations that did not move, shape ``(n,)``; their rewards are ignored.
+            diverged: Indices of simulations that did not move, shape ``(n,)``. Their rewards are ignored.
         """
 
     def terminated(self) -> Tensor:
-        """Whether the step just made ended the episode, by failure or success, ``(N,)``: by default it did not."""
+        """Whether the last step ended the episode, by failure or success, ``(N,)``, bool; by default it did not."""
         return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
 
     def truncated(self) -> Tensor:
-        """Whether the episode is cut short for a reason other than the time limit, ``(N,)``: by default it is not."""
+        """Whether to cut the episode short for another reason than the time limit, ``(N,)``, bool; by default not."""
         return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
 
     def update_goal(self) -> None:
-        """Change the goal after the reward of a step, for the next action: a direction that wanders, say."""
+        """Change the goal for the next action, after the reward of a step. For example, a direction wanders."""
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`\bar{R} = R / T`.
@@ -244,7 +259,7 @@ class CharacterEnv(EnvBase):
         )
 
     def reach(self) -> Reach | None:
-        """Returns of standing still and of an ideal player in the episodes just begun, None if the task has none."""
+        """Returns of standing still and of an ideal player in the present episodes, or None if they are unknown."""
         return None
 
     @property
@@ -256,7 +271,7 @@ class CharacterEnv(EnvBase):
         """Set the goal of the first simulation as a user wants it, until the end of the next step.
 
         Args:
-            goal: The user's wishes; without any, the task has its goal back.
+            goal: The user's goal. Quantities that are None return to the task.
         """
 
     @property
@@ -265,21 +280,21 @@ class CharacterEnv(EnvBase):
         return self.simulation.physics_seconds
 
     def to(self, device: torch.device | str | int) -> "CharacterEnv":
-        """Return itself: the physics cannot move.
+        """Return the environment itself, because the physics cannot move to another device.
 
         Raises:
             ValueError: If ``device`` is of another type than the physics.
         """
         if torch.device(device).type != self.device.type:
-            raise ValueError(f"device={device}: the physics stays on {self.device}. Move what the environment emits")
+            raise ValueError(f"device={device}: the physics stays on {self.device}, so move the outputs instead")
         return self
 
     def get_state(self) -> TensorDict:
         """Snapshot of the whole state except ``generator``, each entry ``(N, ...)``.
 
-        ``reset(state, set_state=True)`` restores it, and the continuation is bit-identical. ``qpos`` and ``qvel`` alone
-        are a state as well: the other entries then take their values at the beginning of an episode, in which the
-        character stands at the origin and faces x.
+        ``reset(state, set_state=True)`` restores the snapshot, and the continuation is bit-identical. A state may also
+        consist of ``qpos`` and ``qvel`` alone. The other entries then have their values at the beginning of an episode
+        in which the character stands at the origin and faces x.
         """
         state = {**self.simulation.state, **self.episode}
         return TensorDict({key: value.clone() for key, value in state.items()}, self.batch_size, device=self.device)
@@ -306,12 +321,12 @@ class CharacterEnv(EnvBase):
         return camera.picture(self.simulation.data(index), self.arrows(index), distance=distance)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the camera."""
+        """Release the camera."""
         self._close_camera()
         super().close(raise_if_closed=raise_if_closed)
 
     def arrows(self, index: int) -> list[Arrow]:
-        """Return arrows to the target of one simulation, for films and viewers; tasks override it.
+        """Return arrows to the target of one simulation, for films and viewers. Tasks override this method.
 
         Args:
             index: The simulation.
@@ -341,7 +356,7 @@ class CharacterEnv(EnvBase):
         seen = self._observed_of(ALL)
         name = f"{type(self).__name__}.observe()"
         if lost := [key for key in ("observation", "goal") if key not in seen]:
-            raise ValueError(f"{name} lacks {lost[0]}: return one, of shape ({self.num_envs}, 0) for nothing")
+            raise ValueError(f"{name} lacks {lost[0]}: return it, with shape ({self.num_envs}, 0) if it is empty")
         if wrong := [key for key, value in seen.items() if value.ndim != 2 or len(value) != self.num_envs]:
             raise ValueError(
                 f"{wrong[0]} of {name} has shape {tuple(seen[wrong[0]].shape)}: return ({self.num_envs}, numbers)"
@@ -440,7 +455,7 @@ class CharacterEnv(EnvBase):
             raise ValueError(f"set_state=True without {sorted(missing)}: pass at least qpos and qvel, or get_state()")
         for key, value in given.items():
             if key not in known:
-                raise ValueError(f"{key!r} is not a part of the state: remove it; the parts are {sorted(known)}")
+                raise ValueError(f"{key!r} must not be in a state: remove it; a state has the parts {sorted(known)}")
             if value.shape != known[key].shape:
                 raise ValueError(f"{key} has shape {tuple(value.shape)}: pass {tuple(known[key].shape)}")
             if value.dtype is not torch.bool and not (value[ids].abs() < LARGEST).all():

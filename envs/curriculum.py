@@ -1,4 +1,4 @@
-"""Aids for training: how its episodes differ from those of a task."""
+"""Curricula: how training episodes differ from the episodes of a task."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -10,25 +10,34 @@ from torchrl_mcp.envs.motions.library import MotionLibrary
 
 @dataclass(frozen=True)
 class Curriculum:
-    """How training episodes differ from those of a task; by default, they do not.
+    """How training episodes differ from the episodes of a task. By default they do not differ.
 
-    Episodes may begin in motion, and in easier situations. Training may use another reward, as tasks say; the output
-    then has the task's own as ``task_reward`` (1) beside ``reward``.
+    Episodes may begin in motion or in easier situations. Training may use another reward, which the tasks describe. The
+    environment then returns the task's own reward as ``task_reward`` ``(N, 1)`` beside ``reward``.
 
     Args:
         initial_states: ``"rest"``, ``"motions"`` or a weight for each, see
             :class:`~torchrl_mcp.envs.initial_states.InitialStates`.
-        motions: Motions for initial states, None for the character's generated ones.
+        motions: Motions for initial states; None for the generated motions of the character.
         mixture: Alternatives to the task's ranges, see :class:`~torchrl_mcp.envs.tasks.ranges.Ranges`.
-        reward_weights: Weights of the terms of the reward for training; None to train with the task's own reward.
-        target_distance_power: Power of the distance to the target in the reward with other weights.
-        random_first_length: Shorten the first episodes by different lengths, evenly spread over the simulations, so
-            that these are at different times of their episodes: otherwise a batch of short trajectories would cover a
-            single time.
-        discount: Discount factor of the learner, for the worth of a success, which ends the episode.
+        reward_weights: Weights of the terms of the reward in training; None to train with the task's own reward.
+        target_distance_power: Power of the distance to the target in a reward with ``reward_weights``.
+        random_first_length: Whether to shorten the first episodes by different lengths, spread evenly over the
+            simulations. Then simulations are at different times of their episodes; otherwise a batch of short
+            trajectories would cover a single time.
+        discount: Discount factor of the learner. It determines what a success is worth that ends the episode.
 
     Raises:
         ValueError: If the discount is out of range.
+
+    Example:
+        Half of the episodes begin in motion, and their first lengths differ.
+
+        >>> from torchrl_mcp.envs import Curriculum, Heading
+        >>> curriculum = Curriculum(initial_states={"rest": 0.5, "motions": 0.5}, random_first_length=True)
+        >>> env = Heading("biped", num_envs=4, curriculum=curriculum, seed=0)
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([4, 3, 1])
     """
 
     initial_states: str | Mapping[str, float] = "rest"
@@ -44,7 +53,7 @@ class Curriculum:
             raise ValueError(f"discount={self.discount} is out of range: pass the learner's, above 0 and at most 1")
         if self.reward_weights is not None and self.discount == 1:
             raise ValueError(
-                "reward_weights with discount=1: a success is worth full reward for ever, pass a discount below 1"
+                "reward_weights with discount=1 make a success worth infinite reward: pass a discount below 1"
             )
 
     @property
@@ -54,16 +63,16 @@ class Curriculum:
 
     @classmethod
     def of(cls, given: "Curriculum | Mapping[str, Any] | None") -> "Curriculum":
-        """Return a curriculum, also from its arguments by name, or from None for the task's own episodes.
+        """Return a curriculum as it is, or make one from its arguments by name, or from None, which changes nothing.
 
         Raises:
-            ValueError: If it is none of these, or a name is unknown.
+            ValueError: If ``given`` is of another type, or a name is unknown.
         """
         if isinstance(given, Curriculum):
             return given
         known = ", ".join(field.name for field in fields(cls))
         if not isinstance(given, Mapping | None):
-            raise ValueError(f"curriculum={given} is not a curriculum: pass null for none, or some of {known} by name")
+            raise ValueError(f"curriculum={given} must be null, or some of these settings by name: {known}")
         arguments = dict(given or {})
         if unknown := arguments.keys() - {field.name for field in fields(cls)}:
             raise ValueError(f"curriculum names {sorted(unknown)}: pass some of {known}")

@@ -1,4 +1,4 @@
-"""Characters under PD control: state, falls and scene, for all their tasks."""
+"""Characters under PD control: state, falls and scene, for all tasks with a character."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -33,37 +33,61 @@ CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCon
 class PDCharacterEnv(CharacterEnv):
     r"""A character that follows target poses, on flat ground.
 
-    ``action``, in [-1, 1], scales to the targets of the PD controllers: exponential maps for ball joints and angles for
-    hinges. Zero is the rest pose, standing upright; 1 is half the width of the target's range, to which the target is
-    clipped. ``observation`` is :func:`~torchrl_mcp.envs.observations.character_state`; ``observation_layout`` has the
-    names of its entries. ``com`` (N, 3) is the centre of mass, a live view, and ``velocity("com")`` its velocity.
+    - ``action`` ``(N, A)``, from -1 to 1, sets the targets of the PD controllers: exponential maps for ball joints,
+      angles for hinges, both in radians. The action 0 is the rest pose, in which the character stands upright. The
+      action 1 is half the width of the target's range, to which the target is clipped.
+    - ``observation`` ``(N, S)`` is :func:`~torchrl_mcp.envs.observations.character_state`. ``observation_layout`` has
+      the names of its entries.
+    - ``com`` ``(N, 3)`` is the centre of mass in metres, a live view; ``velocity("com")`` is its velocity in m/s.
 
-    The character *falls* when any body but its feet touches the ground. That ends the episode; the reward of the fall
-    is 0, whatever ``reward`` returns. Episodes begin at rest. A ``curriculum`` changes training; if it has
-    ``reward_weights``, the reward is :meth:`training_reward`.
+    Episodes begin at rest. The character *falls* when any body but its feet touches the ground. A fall ends the
+    episode, and the reward of this step is 0, whatever ``reward`` returns.
+
+    A ``curriculum`` changes training episodes. If it has ``reward_weights``, the reward is :meth:`training_reward`.
 
     Args:
-        character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
+        character: Name of a character, such as ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
-        episode: Task state of one simulation at the beginning of an episode.
+        episode: Variables of the task in one simulation at the beginning of an episode, by name.
         furnish: Function that adds the task's objects to the scene, after character, ground and light.
         curriculum: How training differs from the task, a :class:`~torchrl_mcp.envs.curriculum.Curriculum` or its
             arguments by name; None for the task itself.
-        physics_timestep: Seconds, a whole fraction of 1/30; None is the character's own choice.
-        self_collision: Let bodies of the character collide with one another.
+        physics_timestep: Duration of a physics step in seconds, 1/30 divided by a whole number; None for the value of
+            the character.
+        self_collision: Whether bodies of the character collide with one another.
         friction_cone: MuJoCo's cone of contact forces, ``"pyramidal"`` or ``"elliptic"``. A pyramid has edges along the
-            world's axes: a motion turned by 45 degrees slides differently. An ellipse has no edges, but reduces the
-            speed by 26 to 38 %.
-        terminate_on_fall: End the episode of a fallen character.
+            world's axes, so that a motion that is turned by 45 degrees slides differently. An ellipse has no edges, but
+            reduces the speed of the simulation by 26 to 38 %.
+        terminate_on_fall: Whether a fall ends the episode.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.base.CharacterEnv`.
 
     Raises:
         ValueError: If an argument is out of range.
+
+    Example:
+        A task in which a character earns reward for being high above the ground, in metres.
+
+        >>> import torch
+        >>> from torchrl_mcp.envs import PDCharacterEnv
+        >>> class StandTall(PDCharacterEnv):
+        ...     def __init__(self, character, num_envs, *, max_episode_steps=300, **kwargs):
+        ...         super().__init__(character, num_envs, max_episode_steps=max_episode_steps, **kwargs)
+        ...         self.make_specs()
+        ...
+        ...     def observe(self, ids):
+        ...         state, _ = self.see(ids)
+        ...         return {"observation": state, "goal": state[:, :0]}
+        ...
+        ...     def reward(self):
+        ...         return self.com[:, 2].clone()
+        >>> env = StandTall("humanoid", num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([2, 3, 1])
     """
 
     num_reward_terms = 0
-    """Number of terms of the task's reward that ``reward_weights`` of a curriculum may weigh."""
+    """Number of terms of the task's reward that the ``reward_weights`` of a curriculum may weigh."""
 
     units: Mapping[str, str] = MappingProxyType(UNITS)
 
@@ -157,7 +181,7 @@ class PDCharacterEnv(CharacterEnv):
         """See :meth:`CharacterEnv.mirrors`.
 
         Raises:
-            ValueError: If the character's frames are no mirror images of each other.
+            ValueError: If the frames of right and left bodies are not mirror images of each other.
         """
         require_mirror_images(self.character.spec().compile(), self.character.sides)
         return {
@@ -186,7 +210,7 @@ class PDCharacterEnv(CharacterEnv):
         return outputs["xpos"][:, index], outputs["xquat"][:, index]
 
     def see(self, ids: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """State s of characters, and the objects around them.
+        """Return the state s of characters, and the objects around them.
 
         Args:
             ids: The simulations, as indices ``(n,)`` or the slice of all.
@@ -202,7 +226,7 @@ class PDCharacterEnv(CharacterEnv):
     def training_reward(self) -> Tensor:
         """Reward of the last step with the curriculum's ``reward_weights``, ``(N,)``, float64.
 
-        Tasks define it whose reward has terms to weigh, ``num_reward_terms``.
+        A task whose reward has several terms (``num_reward_terms``) defines this method.
         """
         raise NotImplementedError
 
@@ -210,14 +234,14 @@ class PDCharacterEnv(CharacterEnv):
         """See :meth:`CharacterEnv.make_specs`.
 
         Raises:
-            ValueError: If the curriculum mixes ranges of a task that draws from none.
+            ValueError: If the curriculum mixes ranges, but the task has none.
         """
         if self.curriculum.mixture and not hasattr(self, "ranges"):
-            raise ValueError(f"mixture is for ranges, and {type(self).__name__} draws from none: leave it out")
+            raise ValueError(f"mixture mixes ranges, but {type(self).__name__} has none: leave it out")
         super().make_specs()
 
     def _outcome(self, diverged: Tensor) -> tuple[Tensor, Tensor]:
-        """Reward and end of the step: a fall earns nothing, and ends the episode unless told otherwise."""
+        """Reward and end of the step. A fall earns nothing, and ends the episode with ``terminate_on_fall``."""
         fallen = self.fallen()
         reward, terminated = super()._outcome(diverged)
         reward = reward.masked_fill(fallen, 0.0)
@@ -251,9 +275,9 @@ class PDCharacterEnv(CharacterEnv):
         return self._centre + action * self._scale
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
-        """Return the scene at rest with the character as the curriculum says, and the first episodes shortened.
+        """Return the scene at rest, with the character and the length of first episodes as the curriculum says.
 
-        Tasks add their draws to it.
+        Tasks add what they draw.
         """
         qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
         start = self.initial_states.fill({"qpos": self._rest.repeat(num, 1), "qvel": qvel}, self.generator)
@@ -264,7 +288,7 @@ class PDCharacterEnv(CharacterEnv):
 
 
 def task_reward(outcome: TensorDictBase) -> Tensor:
-    """The task's own reward of steps, also if training uses another, ``(*B, 1)``.
+    """The task's own reward of steps, ``(*B, 1)``, even if training uses another reward.
 
     Args:
         outcome: Output of an environment's steps, batch size ``(*B,)``.

@@ -36,30 +36,32 @@ RELEASE_GAP = CLEARANCE + RESTING_GAP
 class Carry(Transport):
     """A character takes a box from a source table to a target table.
 
-    The character's ``carrier`` takes the box by touching it while it stands on the source: a joint then fixes the box
-    to the carrier, and the source sinks by 10 cm. The joint opens once the box is over the target, less than 11 cm
-    above it, and does not close again within the episode. *Over* means that the centre of the box is over the top; a
-    box *stands* there if its lowest point is less than 1 cm above it. A box that was knocked off the source cannot be
-    taken. ``box_taken`` (1, bool) is whether the box was taken in this episode, and ``success`` (1, bool) whether it
-    then was let go and stands on the target.
+    **Taking and releasing the box.** The character's ``carrier`` takes the box when it touches the box on the source.
+    A joint then fixes the box to the carrier, and the source sinks by 10 cm. The joint opens when the centre of the box
+    is over the target's top and less than 11 cm above it, and does not close again within the episode. A box that was
+    knocked off the source cannot be taken.
 
-    ``goal`` (27) is position and orientation of the target table, of the source table and of the box, and linear and
-    angular velocity of the box, in the character's heading frame, with positions relative to the root; ``goal_layout``
-    has the names of its entries. A table's position is the middle of its top.
+    **Metrics.** ``box_taken`` (1, bool) says whether the box was taken in this episode. ``success`` (1, bool) says
+    whether the box was taken and released and stands on the target, that is, less than 1 cm above its top.
 
-    At the source's height, the box is level with the carrier's centre of mass in the rest pose. Tables hold the box;
-    characters pass through them, because a top at waist height would be a wall. The carrier passes through the box,
-    because contact would work against the joint.
+    **Goal.** ``goal`` (27) has, in the character's heading frame and with positions in metres relative to the root:
 
-    The reward is by default as printed in the paper. Two variants of the same authors' public code are options: the
+    - position and orientation of the target table, whose position is the middle of its top,
+    - position and orientation of the source table,
+    - position, orientation, linear and angular velocity of the box.
+
+    ``goal_layout`` has the names of these entries.
+
+    **Scene.** The box on the source is level with the carrier's centre of mass in the rest pose. Tables hold the box,
+    but characters pass through tables, because a top at waist height would be a wall. The carrier passes through the
+    box, because contact would work against the joint. The tables stand apart, and the box begins where it does not
+    touch the character: the lower bounds of ``object_distances`` and ``target_distances`` are raised accordingly.
+
+    **Reward.** By default, the reward is the paper's. Two variants of the same authors' public code are options: the
     distance to the target instead of its square, which still has a gradient at 10 m, and reward 1 while successful. A
-    box at rest on the target has a printed reward of at most 0.73; with the second variant it is 1.
-
-    With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode.
-
-    The tables stand apart, and the box begins where it touches no character: lower bounds of ``object_distances`` and
-    ``target_distances`` are raised until this is so.
+    box at rest on the target earns at most 0.73 with the paper's reward, and 1 with the second variant. With
+    ``reward_weights`` of a curriculum, training uses :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a
+    success ends the episode.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -74,6 +76,7 @@ class Carry(Transport):
         appendix D, https://arxiv.org/abs/1905.09808
 
     Example:
+        >>> from torchrl_mcp.envs import Carry
         >>> env = Carry("biped", num_envs=2, seed=0)
         >>> env.rollout(3)["next", "goal"].shape
         torch.Size([2, 3, 27])

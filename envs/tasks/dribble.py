@@ -35,24 +35,27 @@ FIFA's test manual for turf (2015) asks for a rebound of 0.6 to 1.0 m from 2 m, 
 class Dribble(Transport):
     """A character moves a ball to a target.
 
-    ``goal`` (16) is the position of the target, and position, orientation, linear and angular velocity of the ball, in
-    the character's heading frame, with positions relative to the root; ``goal_layout`` has the names of its entries.
-    ``success`` (1, bool) is whether the ball is at the target, that is, horizontally within 0.5 m, and the character
-    within 2 m of the ball.
+    **Goal.** ``goal`` (16) has the position of the target, and the position, orientation, linear and angular velocity
+    of the ball, in the character's heading frame, with positions in metres relative to the root. ``goal_layout`` has
+    the names of these entries.
 
-    The ball collides with the ground and the whole character, with its own friction. Its damping slows translation and
-    rotation alike, so that it rolls without slipping and its speed falls to 60 % in a second. It bounces like a
-    football.
+    **Metrics.** ``success`` (1, bool) says whether the ball is horizontally within 0.5 m of the target and the
+    character within 2 m of the ball.
 
-    The variants of the reward are those of :class:`~torchrl_mcp.envs.Carry`: a ball at rest at the target has a printed
-    reward of at most 0.73. With ``reward_weights`` of a curriculum, training uses
+    **Ball.** The ball collides with the ground and with the whole character, and has its own friction. Its damping
+    slows translation and rotation alike, so that it rolls without slipping and loses 40 % of its speed in a second. It
+    bounces like a football.
+
+    **Reward.** The reward has the variants of :class:`~torchrl_mcp.envs.Carry`. A ball at rest at the target earns at
+    most 0.73 with the paper's reward. With ``reward_weights`` of a curriculum, training uses
     :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and a success ends the episode.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
-        object_distances: Range (lo, hi) of the ball's distance from the character, in metres. Paper: 0 to 10; here from
-            0.5, as in the same authors' public code, or from the first distance without contact if that is larger.
+        object_distances: Range (lo, hi) of the ball's distance from the character, in metres. The paper's range is 0 to
+            10. The default begins at 0.5, as in the same authors' public code, or at the first distance without contact
+            if this is larger.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.tasks.transport.Transport`, where the arguments are described.
 
     Raises:
@@ -63,6 +66,7 @@ class Dribble(Transport):
         appendix D, https://arxiv.org/abs/1905.09808
 
     Example:
+        >>> from torchrl_mcp.envs import Dribble
         >>> env = Dribble("biped", num_envs=2, seed=0)
         >>> env.rollout(3)["next", "goal"].shape
         torch.Size([2, 3, 16])

@@ -1,4 +1,4 @@
-"""The heading task: walk in a direction that keeps changing, also at changing speeds."""
+"""The heading task: walk in a direction that keeps changing, and optionally at changing speeds."""
 
 from collections.abc import Sequence
 from types import MappingProxyType
@@ -27,22 +27,24 @@ class Heading(PDCharacterEnv):
 
     .. math:: \hat{\theta}_t = \hat{\theta}_{t-1} + \mathrm{Uniform}(-\delta, \delta)
 
-    ``goal`` (2) is the unit vector of the target direction in the character's heading frame. The reward of a step
-    uses the direction that the action could see.
+    ``goal`` (2) is the unit vector of the target direction in the character's heading frame. The reward of a step uses
+    the direction that the policy saw when it acted.
 
-    With a range of speeds, another speed is drawn now and then, ``goal`` (3) ends with the speed in m/s, and motion
-    across the direction counts too, see :func:`~torchrl_mcp.envs.tasks.rewards.velocity_reward`.
+    With a range of speeds, the task draws a new speed from time to time, and ``goal`` (3) ends with the speed in m/s.
+    The reward then also depends on the velocity across the direction, see
+    :func:`~torchrl_mcp.envs.tasks.rewards.velocity_reward`.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         max_turn: Largest change :math:`\delta` of the direction per step, in radians. Paper: 0.15.
-        speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin with 0. Paper: 1.
-        speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for none.
-        waypoint: End the goal with a place in the target direction, as :func:`.place_seen` shows it, see
-            :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`. ``goal_layout`` has the names of the entries.
+        speed: Target speed :math:`\hat{v}`, in m/s, or a range (lo, hi), which may begin at 0. Paper: 1.
+        speed_interval: Mean time between changes of the speed in a range, in seconds; infinite for no changes.
+        waypoint: Whether the goal ends with a place in the target direction, see
+            :func:`~torchrl_mcp.envs.tasks.waypoints.place_ahead`, as :func:`.place_seen` shows it. ``goal_layout`` has
+            the names of the entries.
         initial_directions: Range (lo, hi) of the first direction, in radians from the direction that the character
-            faces. The paper does not say; its returns of 0.97 leave no time to turn round, hence the default.
+            faces. The paper does not specify it. Its returns of 0.97 leave no time to turn round, hence the default.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``; 600 are 20 s.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -54,6 +56,7 @@ class Heading(PDCharacterEnv):
         appendix D, https://arxiv.org/abs/1905.09808
 
     Example:
+        >>> from torchrl_mcp.envs import Heading
         >>> env = Heading("biped", num_envs=2, seed=0)
         >>> env.rollout(3)["next", "observation"].shape
         torch.Size([2, 3, 105])

@@ -1,4 +1,4 @@
-"""The holdout task: an ant walks in directions it was not trained in."""
+"""The holdout task: an ant runs in directions that pre-training held out."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -28,26 +28,28 @@ CONTACT_FORCE_RANGE = (-1.0, 1.0)
 class Holdout(CharacterEnv):
     """Gymnasium's Ant-v5 with a target direction, drawn for each episode and observed as ``goal``.
 
-    The paper pre-trains with directions in [0, 3/2 pi] and transfers to the held out [3/2 pi, 2 pi]. With the direction
-    +x, states and rewards equal those of Gymnasium's Ant-v5: in particular, the velocity is measured at the torso, as
-    there, and the control cost is computed from the unclipped action, though the motors clip it to [-1, 1].
+    The paper pre-trains with directions in [0, 3/2 pi] and transfers to the held-out directions [3/2 pi, 2 pi]. With
+    the direction +x, states and rewards equal those of Gymnasium's Ant-v5. In particular, the velocity is measured at
+    the torso, and the control cost is computed from the unclipped action, although the motors clip it to [-1, 1].
 
-    ``observation`` (27) is the root's height and orientation (quaternion), 8 joint angles, and 14 velocities; ``goal``
-    (2) is (cos, sin) of the direction.
+    - ``observation`` (27) has the root's height and orientation (quaternion), 8 joint angles, and 14 velocities.
+    - ``goal`` (2) is (cos, sin) of the direction.
+    - ``action`` (8) has the controls of the torque motors, as in Ant-v5, every 0.05 s.
 
     Args:
         num_envs: Number N of simulations.
         directions: Range (lo, hi) of target directions in radians, counted from +x towards +y.
         max_episode_steps: Actions of 0.05 s until an episode is ``truncated``.
-        contact_forces: Observe the clipped external forces on 13 bodies (78 more numbers) and add their cost to the
-            reward, as Ant-v5 does by default. They were always zero with MuJoCo 2.0, at the paper's time, hence the
-            default here. They take about 20 microseconds per simulation and step, on one thread.
+        contact_forces: Whether to observe the clipped external forces on 13 bodies (78 more numbers) and to subtract
+            their cost from the reward, as Ant-v5 does by default. At the paper's time, with MuJoCo 2.0, these forces
+            were always zero, hence the default here. They take about 20 microseconds per simulation and step, on one
+            thread.
         forward_weight: Weight of the velocity in the target direction, per m/s.
         healthy_weight: Reward per step for being healthy.
         control_weight: Cost of the squared action.
         contact_weight: Cost of the squared contact forces.
         healthy_z_range: Lowest and highest healthy height of the torso, in metres.
-        terminate_when_unhealthy: End the episode of an unhealthy ant.
+        terminate_when_unhealthy: Whether the episode of an unhealthy ant ends.
         reset_noise_scale: Half-width of the uniform noise on the initial positions, and standard deviation of the
             normal noise on the initial velocities.
         dtype: Type of the outputs.
@@ -62,6 +64,7 @@ class Holdout(CharacterEnv):
 
     Example:
         >>> import math
+        >>> from torchrl_mcp.envs import Holdout
         >>> env = Holdout(num_envs=2, directions=(0.0, 1.5 * math.pi), seed=0)
         >>> env.rollout(3)["next", "observation"].shape
         torch.Size([2, 3, 27])

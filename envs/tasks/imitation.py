@@ -38,25 +38,32 @@ CLIP_ENDS = ("truncate", "switch")
 class Imitation(PDCharacterEnv):
     r"""A character follows reference motions, which change in the middle of an episode.
 
-    An episode begins at a random moment of a random clip, in the state of the reference. With probability
-    :math:`\Delta t /` ``switch_interval`` per step the reference jumps to another random moment, moved to the
-    character's position and heading: of ``switch_candidates`` moments, the one with the bodies closest to the
-    character's, by :func:`~torchrl_mcp.envs.tasks.imitation_reward.mismatch`.
+    **Reference.** An episode begins at a random moment of a random clip, in the state of the reference. With
+    probability :math:`\Delta t /` ``switch_interval`` per step, the reference jumps to another moment, and is moved to
+    the character's position and heading. This moment is the most similar one of ``switch_candidates`` random moments:
+    the one whose bodies are closest to the character's, by
+    :func:`~torchrl_mcp.envs.tasks.imitation_reward.mismatch`.
 
-    ``goal`` (2 x 13 L) holds, for the next two steps, the positions of the reference's L bodies relative to the ground
-    below the character, their orientations and velocities, in the character's heading frame. ``tracking_error`` (1) is
-    the mean distance of the bodies from the reference after the step, in metres, and ``reward_terms`` (I) are the
-    reward's terms before a fall sets it to 0.
+    **Goal.** ``goal`` (2 x 13 L) has, for each of the next two steps, the positions of the reference's L bodies
+    relative to the ground below the character, their orientations and their velocities, in the character's heading
+    frame.
 
-    The reward is the sum of :func:`~torchrl_mcp.envs.tasks.imitation_reward.imitation_rewards` of these errors:
-    ``pose``, the mean squared angle of joints; ``velocity``, the mean squared difference of their velocities;
-    ``root_pose`` and ``root_velocity``, the squared distance plus a tenth of the squared angle of the root;
-    ``key_positions``, the mean squared distance of the character's key bodies relative to the root; ``bodies``, the
-    mean squared distance of all bodies in the world; ``orientations``, the mean squared angle of all bodies in the
-    world; ``com``, the squared distance of the centre of mass.
+    **Reward.** The reward is the sum of :func:`~torchrl_mcp.envs.tasks.imitation_reward.imitation_rewards` of the
+    errors that ``terms`` names:
 
-    An episode terminates, with reward 0, when the character falls or its bodies are on average further than
-    ``max_error`` from the reference. The end of a clip that does not loop truncates the episode, as the time limit
+    - ``pose``: the mean squared angle of joints,
+    - ``velocity``: the mean squared difference of the joints' velocities,
+    - ``root_pose``, ``root_velocity``: the squared distance plus a tenth of the squared angle of the root,
+    - ``key_positions``: the mean squared distance of the character's key bodies relative to the root,
+    - ``bodies``: the mean squared distance of all bodies in the world,
+    - ``orientations``: the mean squared angle of all bodies in the world,
+    - ``com``: the squared distance of the centre of mass.
+
+    **Metrics.** ``tracking_error`` (1) is the mean distance of the bodies from the reference after the step, in metres.
+    ``reward_terms`` (I) are the terms of the reward before a fall sets the reward to 0.
+
+    **End.** An episode terminates, with reward 0, when the character falls or when the mean distance of its bodies from
+    the reference exceeds ``max_error``. The end of a clip that does not loop truncates the episode, as the time limit
     does.
 
     Args:
@@ -65,15 +72,15 @@ class Imitation(PDCharacterEnv):
         num_envs: Number N of simulations.
         terms: Weight and scale of each error in the reward, by name.
         max_error: Largest mean distance of bodies from the reference, in metres; 0.5 is clearly worse than 0.3.
-        switch_interval: Mean time between changes of the reference, in seconds; infinite for none. Not stated in
-            the paper.
-        switch_candidates: Number of random moments of which the most similar becomes the reference. With 1,
-            "switched randomly" as in section 5.1, some changes are impossible for a body, as from a fast walk to
-            standing; more candidates make them easier.
-        switch_to: ``"any"`` clip, or the ``"same"``, which moves the reference back to a character that has drifted
-            away and does not observe it.
-        clip_end: Action at the end of a clip that does not loop: ``"truncate"`` the episode, or ``"switch"`` to
-            another reference, so that every episode lasts until its time limit or a failure.
+        switch_interval: Mean time between changes of the reference, in seconds; infinite for no changes. The paper does
+            not specify it.
+        switch_candidates: Number of random moments, the most similar of which becomes the reference. With 1, the
+            reference is "switched randomly" as in section 5.1, and some changes are impossible for a body, for example
+            from a fast walk to standing. More candidates make changes easier.
+        switch_to: ``"any"`` clip, or the ``"same"`` clip, which moves the reference back to a character that has
+            drifted away because it does not observe the reference.
+        clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` ends the episode; ``"switch"``
+            changes to another reference, so that every episode lasts until its time limit or a failure.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -83,6 +90,15 @@ class Imitation(PDCharacterEnv):
     Reference:
         Peng et al., MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies, 2019,
         section 4, https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> from torchrl_mcp.envs import Imitation
+        >>> from torchrl_mcp.envs.motions import walking_corpus
+        >>> terms = {"bodies": {"weight": 0.5, "scale": 50.0}, "velocity": {"weight": 0.5, "scale": 0.2}}
+        >>> env = Imitation("biped", walking_corpus("biped", seed=0), num_envs=2, terms=terms, seed=0)
+        >>> trajectories = env.rollout(3)
+        >>> trajectories["goal"].shape, trajectories["next", "tracking_error"].shape
+        (torch.Size([2, 3, 208]), torch.Size([2, 3, 1]))
     """
 
     _next: PlacedMotion  # states of the references after the next step
@@ -122,7 +138,7 @@ class Imitation(PDCharacterEnv):
         self.max_error, self.clip_end = max_error, clip_end
         self.terms = checked_terms(terms)
         if "key_positions" in terms and not CHARACTERS[character].key_bodies:
-            raise ValueError(f"terms names key_positions, and character={character!r} has no key_bodies: name some")
+            raise ValueError(f"terms names key_positions, but character={character!r} has no key_bodies: name some")
         self.switch_candidates, self.switch_to = switch_candidates, switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         names = library.body_names

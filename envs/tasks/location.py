@@ -29,27 +29,31 @@ FACING = math.cos(math.radians(30))
 
 
 class Location(PDCharacterEnv):
-    """A character goes to a place and stands there; now and then, it is sent to another.
+    """A character goes to a place and stands there. From time to time, it is sent to another place.
 
-    ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a logarithmic
-    distance, see :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. A place aside is seen as one to which the
-    character can walk, see :func:`~torchrl_mcp.envs.tasks.waypoints.walkable`. With ``final_directions``, ``goal`` (4)
-    ends with the unit vector of the direction to face at the place. The reward is
-    :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the action could see.
+    **Goal.** ``goal`` (2) is the place relative to the centre of mass in the character's heading frame, with a
+    logarithmic distance, see :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. A place at the character's side is
+    shown as a place to which the character can walk, see :func:`~torchrl_mcp.envs.tasks.waypoints.walkable`. With
+    ``final_directions``, ``goal`` (4) ends with the unit vector of the direction to face at the place.
 
-    A character has arrived within 0.3 m of the place. Metrics: ``success`` (1, bool) is whether it has arrived and
-    stands, that is, its centre of mass is slower than 0.1 m/s, and with ``final_directions`` it faces the direction
-    within 30 degrees. ``at_place`` (1) is 1 where it has arrived, so that its mean is a share of time.
-    ``seconds_to_success`` (1) is the duration of an episode until the first success at a place, and then 0: its mean
-    over an episode with one place is the time to success, or the whole duration without success.
+    **Reward.** The reward is :func:`~torchrl_mcp.envs.tasks.rewards.location_reward`, for the place that the policy saw
+    when it acted.
+
+    **Metrics.** A character has arrived if it is within 0.3 m of the place.
+
+    - ``success`` (1, bool) says whether the character has arrived and stands, that is, its centre of mass is slower
+      than 0.1 m/s, and, with ``final_directions``, whether it faces the direction within 30 degrees.
+    - ``at_place`` (1) is 1 if the character has arrived and 0 otherwise, so that its mean is a share of time.
+    - ``seconds_to_success`` (1) is the duration of the episode until the first success at a place, and 0 afterwards.
+      Its mean over an episode with one place is the time to success, or the whole duration without success.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
         target_distances: Range (lo, hi) of the distance of a new place from the character, in metres.
         target_directions: Range (lo, hi) of the direction of a new place, in radians from the character's heading.
-        target_intervals: Range (lo, hi) of the time until another place is drawn, in seconds. It passes while the
-            character walks and while it stands.
+        target_intervals: Range (lo, hi) of the time until the task draws another place, in seconds. The time passes
+            while the character walks and while it stands.
         final_directions: Range (lo, hi) of the direction to face at the place, in radians from the heading at the time
             of the draw; None if the character may face any direction.
         speed: Target speed far from the place, in m/s.
@@ -64,6 +68,7 @@ class Location(PDCharacterEnv):
         Control, 2021, https://arxiv.org/abs/2104.02180, has a similar one.
 
     Example:
+        >>> from torchrl_mcp.envs import Location
         >>> env = Location("biped", num_envs=2, seed=0)
         >>> env.rollout(3)["next", "goal"].shape
         torch.Size([2, 3, 2])

@@ -1,4 +1,4 @@
-"""What carrying and dribbling share: a character brings an object to a target."""
+"""The base class of carrying and dribbling: a character brings an object to a target."""
 
 import math
 from abc import abstractmethod
@@ -37,22 +37,22 @@ class Transport(PDCharacterEnv):
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
         num_envs: Number N of simulations.
-        object_distances: Range (lo, hi) of the object's distance from the character, in metres. The paper's begins at
-            0; tasks raise lo until the object touches no character.
+        object_distances: Range (lo, hi) of the object's distance from the character, in metres. The paper's range
+            begins at 0; tasks raise lo until the object does not touch the character.
         object_directions: Range (lo, hi) of the direction of the object, in radians from the character's heading.
         target_distances: Range (lo, hi) of the target's distance from the object, in metres.
         target_directions: Range (lo, hi) of the direction from the object to the target, in radians from the direction
             of the object: 0 is straight beyond it.
         speed: Target speed of character and object, in m/s. Paper: 1.
         target_distance_power: Power of the distance between object and target in the reward: 2 (paper) or 1.
-        success_reward: Set the reward to 1 while successful.
+        success_reward: Whether the reward is 1 while successful.
         goal_positions: Form of the horizontal positions in ``goal``: ``"metres"``, or ``"logarithmic"``, see
-            :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. A table is 0.3 m wide, and in standardised metres this
-            is less than a tenth.
-        waypoint: End the goal with the place where the character should go next, see
-            :mod:`~torchrl_mcp.envs.tasks.waypoints`, as :class:`.Location` shows places.
-        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper speaks of thousands of steps;
-            3000 are 100 s, as in the same authors' public code for a ball.
+            :func:`~torchrl_mcp.envs.tasks.places.logarithmic`. (A table is 0.3 m wide, which is less than a tenth in
+            standardised metres.)
+        waypoint: Whether the goal ends with the place where the character should go next, see
+            :mod:`~torchrl_mcp.envs.tasks.waypoints`, in the form in which :class:`.Location` shows places.
+        max_episode_steps: Actions of 1/30 s until an episode is ``truncated``. The paper mentions thousands of steps;
+            3000 steps are 100 s, as in the same authors' public code for a ball.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
     Raises:
@@ -64,7 +64,7 @@ class Transport(PDCharacterEnv):
     units: Mapping[str, str] = MappingProxyType({**UNITS, "waypoint": LOGARITHMIC})
 
     objects: ClassVar[Mapping[str, int]]
-    """The objects in the order of the scene, and how many numbers the goal has of each."""
+    """The objects in the order of the scene, and how many numbers the goal has for each of them."""
 
     weights: ClassVar[tuple[float, float, float, float]]
     """Weights of the four terms of :func:`~torchrl_mcp.envs.tasks.rewards.transport_reward`: the character's speed

@@ -16,22 +16,25 @@ GATES_FLOOR = 1e-8
 
 
 class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
-    r"""Mixture of :math:`K` diagonal Gaussians: a primitive is drawn, then an action from it.
+    r"""Mixture of :math:`K` diagonal Gaussians: a sample draws a primitive first, and then an action from it.
 
     .. math:: \pi(a) = \sum_{k=1}^K \bar w_k \, \mathcal{N}(a; \mu_k, \sigma_k^2), \qquad
         \bar w_k = \frac{w_k}{\sum_{j=1}^K w_j}
 
-    The sum of the gates is at least ``1e-8``: below that, equal gates make up the difference. Without validation,
-    closed gates thus result in an equal mixture instead of a division by zero. Arguments of half precision are promoted
-    to ``float32``, and so are the samples.
+    The mean and the samples have the shape ``(*B, A)`` and the unit of the actions. Log-densities have the shape
+    ``(*B,)`` and are in nats. The entropy has no closed form and is estimated.
+
+    The sum of the gates is at least ``1e-8``. If they sum to less, equal gates make up the difference. Without
+    validation, gates that are all zero therefore result in an equal mixture instead of a division by zero. Arguments of
+    half precision are promoted to ``float32``, and samples are ``float32``.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive; the paper writes its
-            variance as :math:`\sigma`, without the square.
-        gates: Weights, shape ``(*B, K)``, non-negative and not all zero; they are normalised to sum to one.
-        validate_args: Whether to check values; ``None`` follows torch's default, which importing TorchRL switches off.
-            Shapes are always checked.
+        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive. (The paper's :math:`\sigma`
+            is the variance.)
+        gates: Weights, shape ``(*B, K)``, non-negative and not all zero. They are normalised to sum to one.
+        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
+            imported. Shapes are always checked.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
@@ -42,7 +45,9 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
         NeurIPS 2019, https://arxiv.org/abs/1905.09808, Eq. 1.
 
     Example:
-        >>> loc, scale = torch.tensor([[0.0], [4.0]]), torch.ones(2, 1)
+        >>> import torch
+        >>> from torchrl_mcp.distributions import AdditiveGaussian
+        >>> loc, scale = torch.tensor([[0.0], [4.0]]), torch.ones(2, 1)  # two primitives, one action
         >>> policy = AdditiveGaussian(loc, scale, gates=torch.tensor([3.0, 1.0]))
         >>> policy.mean, policy.variance, policy.deterministic_sample
         (tensor([1.]), tensor([4.]), tensor([0.]))
@@ -60,7 +65,7 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
         )
         if self._validate_args and not torch._is_all_true(total > 0):
             raise ValueError(
-                f"gates of shape {tuple(gates.shape)} hold a row of zeros, must leave one primitive open; "
+                f"gates of shape {tuple(gates.shape)} have a row of zeros, but at least one gate must be positive: "
                 "end the gate in a softmax."
             )
 
@@ -101,8 +106,8 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
         .. math:: H = -\sum_{k=1}^K \bar w_k \,
             \mathbb{E}_{\epsilon \sim \mathcal{N}(0, I)} \left[ \log \pi(\mu_k + \sigma_k \epsilon) \right]
 
-        The sum over primitives is exact and the expectation is reparametrised. An estimate from samples of the
-        mixture, which TorchRL falls back on otherwise, has the same value but a gradient of zero on average.
+        The sum over primitives is exact, and the expectation is reparametrised. TorchRL's own estimate from samples of
+        the mixture has the same value, but its gradient is zero on average.
 
         Args:
             num_samples: Noise samples per primitive.
@@ -119,7 +124,7 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
         return (gates * function(actions)).sum(0).mean(0)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> NoReturn:
-        """Raise an error: which primitive a sample comes from has no derivative.
+        """Raise an error, because the choice of the primitive of a sample has no derivative.
 
         Raises:
             NotImplementedError: Always.
@@ -132,7 +137,7 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
 
     @property
     def mode(self) -> Tensor:
-        """Raise an error: the densest action of a mixture has no closed form.
+        """Raise an error, because the densest action of a mixture has no closed form.
 
         Raises:
             NotImplementedError: Always.

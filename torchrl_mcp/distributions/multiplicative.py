@@ -24,22 +24,24 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
         \frac{1}{\sigma^2} = \sum_{k=1}^K \frac{w_k}{\sigma_k^2}, \qquad
         \mu = \sigma^2 \sum_{k=1}^K \frac{w_k}{\sigma_k^2} \mu_k
 
-    Sampling, densities, entropy and Kullback-Leibler divergences come from :class:`torch.distributions.Independent`.
+    The mean, the samples and the standard deviation have the shape ``(*B, A)`` and the unit of the actions.
+    Log-densities and entropies have the shape ``(*B,)`` and are in nats. Sampling, densities, entropy and
+    Kullback-Leibler divergences come from :class:`torch.distributions.Independent`.
 
-    The precision :math:`1 / \sigma^2` is at least ``1e-8`` (a standard deviation of ``1e4``): below that, a zero-mean
-    Gaussian makes up the difference. With all gates closed the composite is :math:`\mathcal{N}(0, 10^8)` instead of a
-    division by zero. Values and gradients are finite there as well.
+    The precision :math:`1 / \sigma^2` is at least ``1e-8``, which is a standard deviation of ``1e4``. If the primitives
+    result in less, a zero-mean Gaussian makes up the difference. If all gates are zero, the composite is therefore
+    :math:`\mathcal{N}(0, 10^8)` instead of a division by zero, and values and gradients remain finite.
 
-    Arguments of half precision are promoted to ``float32``, and so are the samples: a ``bfloat16`` log-density over
-    tens of actions is off by more than the clip range of a policy ratio.
+    Arguments of half precision are promoted to ``float32``, and samples are ``float32``, because a ``bfloat16``
+    log-density over tens of actions is wrong by more than the clip range of a policy ratio.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
-        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive; the paper writes its
-            variance as :math:`\sigma`, without the square.
-        gates: Weights, shape ``(*B, K)``, non-negative; they need not sum to one.
-        validate_args: Whether to check values; ``None`` follows torch's default, which importing TorchRL switches off.
-            Shapes are always checked.
+        scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive. (The paper's :math:`\sigma`
+            is the variance.)
+        gates: Weights, shape ``(*B, K)``, non-negative. They need not sum to one.
+        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
+            imported. Shapes are always checked.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
@@ -51,10 +53,18 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
 
     Example:
         >>> import torch
-        >>> loc, scale = torch.tensor([[0.0], [3.0]]), torch.tensor([[1.0], [2.0]])
+        >>> from torchrl_mcp.distributions import MultiplicativeGaussian
+        >>> loc, scale = torch.tensor([[0.0], [3.0]]), torch.tensor([[1.0], [2.0]])  # two primitives, one action
         >>> policy = MultiplicativeGaussian(loc, scale, gates=torch.tensor([0.5, 2.0]))
         >>> policy.mean, policy.variance
         (tensor([1.5000]), tensor([1.]))
+
+        A batch of 16 states, with eight primitives and three actions:
+
+        >>> policy = MultiplicativeGaussian(torch.randn(16, 8, 3), torch.ones(16, 8, 3), torch.rand(16, 8))
+        >>> action = policy.rsample()
+        >>> action.shape, policy.log_prob(action).shape
+        (torch.Size([16, 3]), torch.Size([16]))
     """
 
     def __init__(self, loc: Tensor, scale: Tensor | float, gates: Tensor, validate_args: bool | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What all compositions share: primitives and gates, their checks and their printed form."""
+"""The base class of all compositions, with the checks of primitives and gates."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -25,7 +25,7 @@ class GatedPrimitives(Distribution):
         return f"{type(self).__name__}({shapes(self.loc, self.scale, self.gates)})"
 
     def cdf(self, value: Tensor) -> Tensor:
-        """Raise an error: actions have several components.
+        """Raise an error, because actions have several components.
 
         Raises:
             NotImplementedError: Always.
@@ -36,7 +36,7 @@ class GatedPrimitives(Distribution):
         )
 
     def icdf(self, value: Tensor) -> Tensor:
-        """Raise an error: actions have several components.
+        """Raise an error, because actions have several components.
 
         Raises:
             NotImplementedError: Always.
@@ -56,9 +56,9 @@ class GatedPrimitives(Distribution):
 def broadcast_primitives(
     loc: Tensor, scale: Tensor | float, gates: Tensor, validate_args: bool | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Bring primitives and gates to one floating-point type and batch shape, after checking them.
+    """Check primitives and gates, and bring them to one floating-point type and one batch shape.
 
-    Shapes are always checked. Values are checked if asked for: on a GPU this waits for the device.
+    Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
@@ -75,8 +75,8 @@ def broadcast_primitives(
     for name, value in (("loc", loc), ("scale", scale), ("gates", gates)):
         if value is None:
             raise ValueError(
-                f"{name} is None, must be a tensor. TorchRL passes None for a key that a sample does not hold: let a "
-                "module before the distribution write it, or store it with the sample."
+                f"{name} must be a tensor, but it is None. TorchRL passes None for a key that a sample lacks: let a "
+                "module before the distribution write this key, or store it with the sample."
             )
     if not isinstance(scale, Tensor):
         scale = torch.as_tensor(scale, dtype=torch.promote_types(loc.dtype, torch.float32), device=loc.device)
@@ -91,8 +91,8 @@ def common_shape(loc: Tensor, scale: Tensor, gates: Tensor) -> Sequence[int]:
     """Return the shape ``(*B, K, A)`` to which primitives and gates broadcast.
 
     An argument may lack batch dimensions or have ones in their place, such as gates ``(*B, K)`` over primitives
-    ``(K, A)``. But one of the arguments must have the whole batch: gates ``(B, 1, K)`` over primitives ``(B, K, A)``
-    would silently make a batch of ``(B, B)``.
+    ``(K, A)``. One of the arguments must have the whole batch, however, because gates ``(B, 1, K)`` over primitives
+    ``(B, K, A)`` would silently make a batch of ``(B, B)``.
 
     Raises:
         ValueError: If there is no such shape, with the shapes and the remedy.
@@ -106,7 +106,7 @@ def common_shape(loc: Tensor, scale: Tensor, gates: Tensor) -> Sequence[int]:
     except RuntimeError as error:
         raise ValueError(f"{shapes(loc, scale, gates)} do not broadcast: {remedy}.") from error
     if gates.shape[-1] != shape[-2]:
-        raise ValueError(f"{shapes(loc, scale, gates)} do not have a gate for each primitive: {remedy}.")
+        raise ValueError(f"{shapes(loc, scale, gates)} must have one gate for each primitive: {remedy}.")
     if shape[:-2] not in [tuple(argument[:-2]) for argument in given]:
         raise ValueError(
             f"{shapes(loc, scale, gates)} have different batch shapes, and would make a batch of {tuple(shape[:-2])}: "
@@ -119,7 +119,7 @@ def check_values(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
     """Check that the values of primitives and gates make a distribution.
 
     Raises:
-        ValueError: If not, with the argument, its value and the remedy.
+        ValueError: If they do not, with the argument, its value and the remedy.
     """
     for name, value, valid, rule in (
         ("loc", loc, loc.isfinite(), "finite; look for a diverged network or an unnormalised observation"),
@@ -127,7 +127,8 @@ def check_values(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
         ("gates", gates, gates.isfinite() & (gates >= 0), "non-negative and finite; end the gate in a sigmoid"),
     ):
         if not torch._is_all_true(valid):  # as in torch.distributions: all() fails under vmap
-            raise ValueError(f"{name} of shape {tuple(value.shape)} holds {value[~valid][0].item()}, must be {rule}.")
+            first = value[~valid][0].item()
+            raise ValueError(f"{name} of shape {tuple(value.shape)} contains {first}, but must be {rule}.")
 
 
 def shapes(loc: Tensor, scale: Tensor, gates: Tensor) -> str:

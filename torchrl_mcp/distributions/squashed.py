@@ -15,38 +15,41 @@ from torchrl_mcp.distributions.primitives import GatedPrimitives
 
 
 class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
-    r"""A :class:`MultiplicativeGaussian` whose samples are squashed to an interval :math:`(l, h)`.
+    r"""A :class:`MultiplicativeGaussian` whose samples are squashed into an interval :math:`(l, h)`.
 
     .. math::
         a = \frac{h + l}{2} + \frac{h - l}{2} \tanh x, \qquad
         x \sim \frac{1}{Z} \prod_{k=1}^K \mathcal{N}(x; \mu_k, \sigma_k^2)^{w_k}
 
-    Soft actor-critic and other losses for bounded actions need it: a Gaussian also samples outside the bounds.
+    Soft actor-critic and other losses for bounded actions need this distribution, because a Gaussian also samples
+    outside the bounds.
 
-    Floating-point actions are kept one rounding step inside the interval. The density of an action on a bound is that
-    of the last action inside. The density of a sample, asked for with the same tensor, uses :math:`x` itself and has no
-    such limit, as TorchRL's off-policy losses need. PPO's loss sees stored actions, so that its ratios of samples on a
-    bound are not one: give it a :class:`MultiplicativeGaussian`, and let the environment clip.
+    Actions are kept one rounding step inside the interval. The density of an action on a bound is the density of the
+    last action inside. If ``log_prob`` receives the very tensor that was sampled, it uses :math:`x` itself, which has
+    no such limit; TorchRL's off-policy losses do this. PPO's loss receives stored actions, and its ratios would not be
+    one for actions on a bound: use a :class:`MultiplicativeGaussian` with PPO, and let the environment clip.
 
     Args:
         loc: Primitive means before squashing, shape ``(*B, K, A)``.
         scale: Primitive standard deviations before squashing, a number or shape ``(*B, K, A)``, positive.
-        gates: Weights, shape ``(*B, K)``, non-negative; they need not sum to one.
-        low: Lower bound :math:`l`, a number or shape ``(A,)``.
-        high: Upper bound :math:`h`, a number or shape ``(A,)``.
-        validate_args: Whether to check values; ``None`` follows torch's default, which importing TorchRL switches off.
-            Shapes are always checked.
+        gates: Weights, shape ``(*B, K)``, non-negative. They need not sum to one.
+        low: Lower bound :math:`l`, a number or shape ``(A,)``, in action units.
+        high: Upper bound :math:`h`, a number or shape ``(A,)``, in action units.
+        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
+            imported. Shapes are always checked.
 
     Raises:
-        ValueError: If the shapes do not match, or numbers ``low`` and ``high`` are in the wrong order or infinite. With
-            validation also for the values that :class:`MultiplicativeGaussian` refuses.
+        ValueError: If the shapes do not match, or if the numbers ``low`` and ``high`` are in the wrong order or
+            infinite. With validation also for the values that :class:`MultiplicativeGaussian` refuses.
 
     Reference:
         Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018, https://arxiv.org/abs/1812.05905,
         appendix C.
 
     Example:
-        >>> loc, scale = torch.tensor([[0.0], [3.0]]), torch.tensor([[1.0], [2.0]])
+        >>> import torch
+        >>> from torchrl_mcp.distributions import TanhMultiplicativeGaussian
+        >>> loc, scale = torch.tensor([[0.0], [3.0]]), torch.tensor([[1.0], [2.0]])  # two primitives, one action
         >>> policy = TanhMultiplicativeGaussian(loc, scale, gates=torch.tensor([0.5, 2.0]), low=0.0, high=2.0)
         >>> policy.deterministic_sample, policy.mean
         (tensor([1.9051]), tensor([1.7408]))
@@ -95,7 +98,7 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
 
     @property
     def mode(self) -> Tensor:
-        """Raise an error: the density of a squashed Gaussian may have two peaks, at no closed form.
+        """Raise an error, because the densest action of a squashed Gaussian has no closed form.
 
         Raises:
             NotImplementedError: Always.
@@ -166,7 +169,7 @@ class Squash(Transform):
         return constraints.interval(self.low, self.high)
 
     def __eq__(self, other: object) -> bool:
-        """Whether the other has the same bounds: then a divergence is that before squashing."""
+        """Whether the bounds are the same; then divergences before and after squashing are equal."""
         return isinstance(other, Squash) and all(
             ours is theirs or bool(torch.as_tensor(ours == theirs).all())
             for ours, theirs in ((self.low, other.low), (self.high, other.high))
@@ -191,10 +194,10 @@ class Squash(Transform):
 
 
 def check_bounds(low: Tensor | float, high: Tensor | float, event_shape: Size, validate: bool) -> None:
-    """Check the bounds of actions: numbers and shapes always, values of tensors if asked for.
+    """Check the bounds of actions: numbers and shapes always, values of tensors with ``validate``.
 
     Raises:
-        ValueError: If they are no bounds of the actions, with the remedy.
+        ValueError: If they cannot be bounds of the actions, with the remedy.
     """
     remedy = "pass finite numbers or tensors of shape (A,), each low below its high"
     shapes = [tuple(bound.shape) for bound in (low, high) if isinstance(bound, Tensor)]
@@ -202,4 +205,4 @@ def check_bounds(low: Tensor | float, high: Tensor | float, event_shape: Size, v
         raise ValueError(f"bounds of shapes {shapes} do not fit {event_shape[0]} actions: {remedy}.")
     ordered = (low < high) & (high - low < math.inf)
     if ordered is False or (validate and not torch._is_all_true(torch.as_tensor(ordered))):
-        raise ValueError(f"low={low} is not below high={high}: {remedy}.")
+        raise ValueError(f"low={low} must be below high={high}: {remedy}.")

@@ -1,8 +1,8 @@
 """The actor that all methods build: networks as TensorDictModules.
 
-A method first makes named *parts*, plain modules that transfer keeps, freezes or re-initialises by name. Then it makes
-an :class:`Actor` over them: ``policy`` acts, and the loss differentiates ``trained``. These are the same module unless
-the primitives are frozen, the exploration acts on the gate, or noise enters before the action.
+A method first makes named *parts*, which are plain modules. Transfer keeps, freezes or makes anew each part by name.
+Then the method makes an :class:`Actor` from the parts: ``policy`` acts, and the loss differentiates ``trained``. Both
+are the same module unless the primitives are frozen, exploration acts on the gate, or noise enters before the action.
 
 | key | content | shape |
 |---|---|---|
@@ -40,17 +40,22 @@ Composition = Callable[[Tensor, Tensor, Tensor], Distribution]
 Explorer = Callable[[Tensor], Tensor]
 """Random exploration of Section 5.3: from normalised states ``(N, S)`` to actions ``(N, A)``, without a goal.
 
-``method.explorer`` makes one from the parts, the number N and a generator.
+``method.explorer`` makes it from the parts, the number N and a generator.
 """
 
 
 class Sizes(NamedTuple):
-    """Sizes of what a method's networks see and do.
+    """Sizes of the inputs and outputs of a method's networks.
 
     Attributes:
         observation: Size of the state, ``S``.
         goal: Size of the goal, ``G``.
         action: Size of the action, ``A``.
+
+    Example:
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> Sizes(observation=105, goal=2, action=17)
+        Sizes(observation=105, goal=2, action=17)
     """
 
     observation: int
@@ -60,16 +65,24 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """A policy in parts: all that collection, losses, diagnostics, films and exports ask of a method.
+    """A policy, and all that collection, losses, diagnostics, films and exports need of it.
 
     Attributes:
-        policy: Module that collection and evaluation run: from ``observation`` and ``goal`` to ``action``.
+        policy: Module that acts, in collection and evaluation: from ``observation`` and ``goal`` to ``action``.
         trained: Module that the loss differentiates: from a stored sample to the distribution of ``sampled``.
-        stored: Keys, beside the environment's own, that a sample must hold for the loss and the diagnostics.
-        drawn: Keys of ``stored`` with random values, rather than values computed from ``observation`` and ``goal``.
-        sampled: Key of the random variable whose log-probability the policy gradient takes.
-        num_options: Number of options of which one acts at a time, 0 for a policy without options. The samples of a
-            policy with options hold the ``option`` that acted.
+        stored: Keys of a sample, beside those of the environment, that the loss and the diagnostics need.
+        drawn: Keys of ``stored`` with random values, which cannot be computed from ``observation`` and ``goal``.
+        sampled: Key of the random variable whose log-probability the policy gradient uses.
+        num_options: Number of options, one of which acts at a time; 0 for a policy without options. The samples of a
+            policy with options contain the ``option`` that acted.
+
+    Example:
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.scratch import gaussian_actor, gaussian_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> actor = gaussian_actor(gaussian_parts(Sizes(observation=105, goal=2, action=17), policy=GaussianPolicy))
+        >>> actor.sampled, actor.log_prob, actor.policy is actor.trained
+        ('action', 'action_log_prob', True)
     """
 
     policy: TensorDictModuleBase
@@ -86,7 +99,14 @@ class Actor:
 
 
 def input_normalisers(sizes: Sizes) -> dict[str, nn.Module]:
-    """Make the parts that :func:`normalise_inputs` needs: ``observation_normaliser`` and ``goal_normaliser``."""
+    """Make the two parts that :func:`normalise_inputs` needs, ``observation_normaliser`` and ``goal_normaliser``.
+
+    Example:
+        >>> from torchrl_mcp.methods.actor import Sizes, input_normalisers
+        >>> parts = input_normalisers(Sizes(observation=105, goal=2, action=17))
+        >>> {name: len(part.mean) for name, part in parts.items()}
+        {'observation_normaliser': 105, 'goal_normaliser': 2}
+    """
     return {
         "observation_normaliser": RunningNormaliser(sizes.observation),
         "goal_normaliser": RunningNormaliser(sizes.goal),
@@ -94,7 +114,13 @@ def input_normalisers(sizes: Sizes) -> dict[str, nn.Module]:
 
 
 def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
-    """Return the module that standardises ``observation`` and ``goal`` by the parts of those names."""
+    """Return the module that standardises ``observation`` and ``goal``.
+
+    It writes the results, of the same shapes, as ``("normalised", "observation")`` and ``("normalised", "goal")``.
+
+    Args:
+        parts: Parts with ``observation_normaliser`` and ``goal_normaliser``, such as :func:`input_normalisers` makes.
+    """
     return TensorDictSequential(
         TensorDictModule(parts["observation_normaliser"], in_keys=["observation"], out_keys=[STATE]),
         TensorDictModule(parts["goal_normaliser"], in_keys=["goal"], out_keys=[GOAL]),
@@ -102,12 +128,12 @@ def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
 
 
 def require_frozen(part: str, frozen: Collection[str], *, over: str) -> None:
-    """Check that exploration over an input of a part, which gives the part no gradient, does not have to train it.
+    """Check that a part is frozen, because exploration over its input gives the part no gradient.
 
     Args:
         part: Name of the part.
         frozen: Names of the parts that do not change in training.
-        over: What is sampled instead of the action.
+        over: Name of the input that is sampled instead of the action.
 
     Raises:
         ValueError: If the part is not frozen.

@@ -1,17 +1,19 @@
-r"""The finetuning model (Section E.3): one motion is imitated, then the goals of a task are injected.
+r"""The finetuning model (Section E.3): a policy imitates one motion, and then gets the goal of a task as a new input.
 
 .. math:: \pi(a|s) = \mathcal{N}(\mu(s, 0), \Sigma) \quad \longrightarrow \quad
     \pi(a|s, g) = \mathcal{N}(\mu(s, J g), \Sigma), \qquad J = 0
 
-As in Berseth et al., the inputs of pre-training stay, and new ones enter the first layer with weights of zero. The
-task begins with the means of the pre-trained policy bit for bit, for any goal, and with new noise (``restart_noise``);
-then all weights train. The paper injects "goal inputs g that are not present during training", hence the policy
-imitates its motion blindly, from the state alone. The critic sees the reference, and is re-initialised for the task. If
-pre-training has the task's own goal, as in the holdout, the policy sees it from the start and keeps its weights.
+As in Berseth et al., the inputs of pre-training stay, and new inputs enter the first layer with weights of zero. The
+task therefore begins with the means of the pre-trained policy, bit for bit, whatever the goal. The noise begins anew
+(``restart_noise``). Then all weights are trained.
 
-A policy that does see the reference (``parts.blind=false`` in pre-training) is transferred in the same way. Its weights
-for the reference are dropped. This amounts to holding these inputs at their mean over pre-training, zero after
-normalisation: the task begins, bit for bit, with the means of the pre-trained policy at that mean.
+The paper injects "goal inputs g that are not present during training". Hence the policy imitates its motion blindly,
+from the state alone. The critic sees the reference, and begins anew for the task. If pre-training has the task's own
+goal, as in holdout, the policy sees the goal from the start and keeps the weights of the goal.
+
+A policy that does see the reference (``parts.blind=false`` in pre-training) is transferred in the same way, without its
+weights for the reference. This amounts to holding these inputs at their mean over pre-training, which is zero after
+normalisation: the task begins, bit for bit, with the means of the pre-trained policy at this mean.
 
 Reference:
     Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808
@@ -35,7 +37,10 @@ def injected_parts(sizes: Sizes, *, policy: Callable[[int, int], InjectedPolicy]
     Args:
         sizes: Sizes of state, goal and action.
         policy: Makes the network from ``(S, A)``.
-        blind: Leave the weights of the goal at zero.
+        blind: Whether the weights of the goal stay at zero.
+
+    Returns:
+        The parts by name.
     """
     network = policy(sizes.observation, sizes.action)
     return nn.ModuleDict(
@@ -53,6 +58,18 @@ def injected_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Act
     Args:
         parts: Made by :func:`injected_parts`.
         frozen: Names of the parts that do not change in training; the policy is still evaluated in full.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.finetune import injected_actor, injected_parts
+        >>> from torchrl_mcp.modules import InjectedPolicy
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> actor = injected_actor(injected_parts(sizes, policy=InjectedPolicy, blind=False))
+        >>> states = TensorDict({"observation": torch.randn(16, 105), "goal": torch.randn(16, 2)}, [16])
+        >>> actor.policy(states)["action"].shape
+        torch.Size([16, 17])
     """
     policy = ProbabilisticTensorDictSequential(
         normalise_inputs(parts),

@@ -18,6 +18,9 @@ def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_o
         sizes: Sizes of state, goal and action.
         primitives: Makes the primitives from ``(S, A, K)``.
         num_options: Number of options, ``K``, each of which is a primitive.
+
+    Returns:
+        The parts by name.
     """
     return nn.ModuleDict(
         {
@@ -37,6 +40,9 @@ def gated_parts(
         gating: Makes the network for the logits of the choice from ``(S, G, K)``.
         primitives: Makes the primitives from ``(S, A, K)``.
         num_options: Number of options, ``K``, each of which is a primitive.
+
+    Returns:
+        The parts by name.
     """
     parts = primitive_parts(sizes, primitives=primitives, num_options=num_options)
     parts["gating"] = gating(sizes.observation, sizes.goal, num_options)
@@ -44,7 +50,7 @@ def gated_parts(
 
 
 def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> Actor:
-    """Let the primitive act whose index the environment sends as ``option``; all primitives train side by side.
+    """Let the primitive act whose index the environment sends as ``option``, so that all primitives train side by side.
 
     Args:
         parts: Made by :func:`primitive_parts`.
@@ -69,14 +75,33 @@ def gated_actor(
         parts: Made by :func:`gated_parts`.
         num_options: Number of options, ``K``, each of which is a primitive.
         steps_per_choice: Control steps for which a primitive acts.
-        action_noise: Whether a primitive samples its actions, from which the gate learns nothing, or plays their mean.
+        action_noise: Whether a primitive samples its actions, which does not help the gate to learn, or plays means.
         frozen: Names of the parts that do not change in training.
 
     Raises:
         ValueError: If the primitives are not frozen, or ``steps_per_choice`` is not positive.
+
+    Example:
+        The environment must have the transform :class:`~torchrl_mcp.methods.transforms.OptionMemory`.
+
+        >>> from functools import partial
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.hierarchical import gated_actor, gated_parts
+        >>> from torchrl_mcp.methods.options import SeparateOptions
+        >>> from torchrl_mcp.methods.transforms import OptionMemory, TransformedCharacterEnv
+        >>> from torchrl_mcp.modules import GaussianPolicy, JointGating
+        >>> primitives = partial(SeparateOptions, policy=GaussianPolicy)
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = gated_parts(sizes, gating=JointGating, primitives=primitives, num_options=7)
+        >>> actor = gated_actor(parts, num_options=7, steps_per_choice=30, frozen=["primitives"])
+        >>> env = TransformedCharacterEnv(Heading("biped", num_envs=2, seed=0), OptionMemory())
+        >>> env.rollout(3, actor.policy)["begins"]  # the gate chooses in the first step
+        tensor([[ True, False, False],
+                [ True, False, False]])
     """
     if "primitives" not in frozen:
-        raise ValueError("the choice of a primitive trains the gate alone: keep 'primitives' in transfer.freeze")
+        raise ValueError("choosing a primitive trains only the gate: keep 'primitives' in transfer.freeze")
     if steps_per_choice < 1:
         raise ValueError(f"steps_per_choice must be at least 1, got {steps_per_choice}")
     gate = WhereBeginning(parts["gating"], num_options)
@@ -113,7 +138,7 @@ class Clock(nn.Module):
         self.steps_per_choice = steps_per_choice
 
     def forward(self, held_steps: Tensor) -> Tensor:
-        """Return whether to choose, ``(*B)``, bool, from the steps since the last choice, 0 if there was none."""
+        """Return whether to choose, ``(*B)``, bool, from the steps since the last choice (0 if there was none)."""
         return held_steps.remainder(self.steps_per_choice) == 0
 
 

@@ -3,15 +3,15 @@ r"""The latent space model (Section E.7): an encoder turns goals into skills, a 
 .. math:: w = \mu_q + \sigma_q \epsilon, \qquad \epsilon \sim \mathcal{N}(0, I), \qquad
     \pi(a|s, w) = \mathcal{N}(\mu(s, w), \mathrm{diag}(\sigma^2))
 
-The noise :math:`\epsilon` is stored with each sample, as if it were part of the state. The loss takes the ratio of
-policies at the same noise and differentiates through :math:`w`, which trains the encoder.
+The noise :math:`\epsilon` is stored with each sample, as if it were part of the state. The loss compares the old and
+the new policy at the same noise and differentiates through :math:`w`, which trains the encoder.
 
 | key | content | shape |
 |---|---|---|
 | ``latent`` / ``noise`` | :math:`\epsilon` | ``(*B, L)`` |
 | ``latent`` / ``loc``, ``scale`` | mean and standard deviation of the encoder | ``(*B, L)`` |
 | ``latent`` / ``sample`` | latent variable :math:`w`, the decoder's view of the goal | ``(*B, L)`` |
-| ``latents`` | the same, where it is the random variable of the policy gradient | ``(*B, L)`` |
+| ``latents`` | the same, if the latent variable is what the policy gradient samples | ``(*B, L)`` |
 
 Reference:
     Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
@@ -60,6 +60,9 @@ def latent_parts(
         decoder: Makes the network for mean and standard deviation of the action from ``(S, L, A)``.
         latent_dim: Size of the latent variable, ``L``.
 
+    Returns:
+        The parts by name.
+
     Raises:
         ValueError: If ``latent_dim`` is not positive.
     """
@@ -75,11 +78,24 @@ def latent_parts(
 
 
 def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor:
-    """Draw a latent variable and act on it; without exploration, on its mean.
+    """Draw a latent variable and an action of its decoder; without exploration, take the means.
 
     Args:
         parts: Made by :func:`latent_parts`.
         frozen: Names of the parts that do not change in training; gradients still pass through a frozen decoder.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.latent_space import latent_actor, latent_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy, StateGoalEncoder
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = latent_parts(sizes, encoder=StateGoalEncoder, decoder=GaussianPolicy, latent_dim=16)
+        >>> states = TensorDict({"observation": torch.randn(32, 105), "goal": torch.randn(32, 2)}, [32])
+        >>> acted = latent_actor(parts).policy(states)
+        >>> acted["action"].shape, acted["latent", "sample"].shape
+        (torch.Size([32, 17]), torch.Size([32, 16]))
     """
     encoder = (
         normalise_inputs(parts),
@@ -99,7 +115,7 @@ def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, froz
     r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
 
     The policy gradient uses the density of the latent variable, as :func:`~torchrl_mcp.methods.mcp.weights_actor` uses
-    that of the weights. So the decoder has no gradient and must be frozen.
+    the density of the weights. The decoder therefore gets no gradient and must be frozen.
 
     Args:
         parts: Made by :func:`latent_parts`.
@@ -108,6 +124,19 @@ def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, froz
 
     Raises:
         ValueError: If the decoder is not frozen.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.latent_space import latent_parts, latents_actor
+        >>> from torchrl_mcp.modules import GaussianPolicy, StateGoalEncoder
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = latent_parts(sizes, encoder=StateGoalEncoder, decoder=GaussianPolicy, latent_dim=16)
+        >>> states = TensorDict({"observation": torch.randn(32, 105), "goal": torch.randn(32, 2)}, [32])
+        >>> acted = latents_actor(parts, frozen=["decoder"]).policy(states)
+        >>> acted["action"].shape, acted["latents_log_prob"].shape
+        (torch.Size([32, 17]), torch.Size([32]))
     """
     require_frozen("decoder", frozen, over="the latent variable")
     fixed = () if latent_std is None else (TensorDictModule(ConstantScale(latent_std), [ENCODING[0]], list(ENCODING)),)
@@ -123,7 +152,7 @@ def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, froz
 
 
 def latent_noise(loc: Tensor) -> Tensor:
-    """Return standard normal noise in the shape of ``loc``, or zeros where TorchRL's exploration is off."""
+    """Return standard normal noise in the shape of ``loc``, or zeros if TorchRL's exploration is off."""
     random = interaction_type() in (InteractionType.RANDOM, None)
     return torch.randn_like(loc) if random else torch.zeros_like(loc)
 

@@ -48,15 +48,21 @@ def composite_parts(
             :meth:`~torchrl_mcp.modules.Primitives.rescale`.
         num_primitives: Number of primitives, ``K``.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
-        initial_std: Standard deviation of the *composite* before training, in action units, for any ``K`` and mixers
-            whose deviation is proportional to that of their primitives, which squashed actions do not have. It includes
-            the variance of each primitive and the variance between their means, and is a root mean square over
-            normalised states and actions.
-        learned_logits_std: Standard deviation of the logits before training, for :func:`weights_actor` to learn it.
-            Without it there is no part ``gate_noise``.
+        initial_std: Standard deviation of the *composite* before training, in action units, for any ``K``. It is a root
+            mean square over normalised states and actions, and includes the variance of each primitive and the
+            variance between the means of the primitives. The mixer's standard deviation must be proportional to that
+            of its primitives, which excludes squashed actions.
+        learned_logits_std: Standard deviation of the logits before training, if :func:`weights_actor` is to learn it.
+            If it is None, there is no part ``gate_noise``.
+
+    Returns:
+        The parts by name.
 
     Raises:
         ValueError: If ``num_primitives`` is not positive, or weights are negative, not finite or all zero.
+
+    Example:
+        See :func:`composite_actor`.
     """
     if num_primitives < 1:
         raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
@@ -85,8 +91,8 @@ def _valid(weights: Tensor) -> Tensor:
     """Return weights ``(*B, K)`` of a gate, if primitives can be composed with them."""
     if not (weights.isfinite().all() and (weights >= 0).all() and (weights.sum(-1) > 0).all()):
         raise ValueError(
-            "gating.activation makes weights that are negative, not finite or all zero, with which no primitives can "
-            "be composed: end it with a sigmoid, a softmax or a softplus"
+            "gating.activation makes weights that are negative, not finite or all zero, which cannot compose "
+            "primitives: end it in a sigmoid, a softmax or a softplus"
         )
     return weights
 
@@ -108,14 +114,30 @@ def composite_actor(
 ) -> Actor:
     r"""Gate K primitives and compose them into one action distribution, :math:`\pi(a|s, g)` of Eq. 4.
 
-    With ``primitives`` among ``frozen``, their outputs are stored with each sample and the loss evaluates the gate
-    alone.
+    If ``frozen`` contains ``primitives``, the outputs of the primitives are stored with each sample, and the loss
+    evaluates the gate alone.
 
     Args:
         parts: Made by :func:`composite_parts`.
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
         frozen: Names of the parts that do not change in training.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.distributions import MultiplicativeGaussian
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.mcp import composite_actor, composite_parts
+        >>> from torchrl_mcp.modules import Gating, Primitives
+        >>> mixer = {"gate_activation": torch.nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+        >>> networks = {"gating": Gating, "primitives": Primitives, "num_primitives": 8, "initial_std": 0.1}
+        >>> parts = composite_parts(Sizes(observation=105, goal=2, action=17), **networks, **mixer)
+        >>> actor = composite_actor(parts, **mixer)
+        >>> states = TensorDict({"observation": torch.randn(16, 105), "goal": torch.randn(16, 2)}, [16])
+        >>> acted = actor.policy(states)
+        >>> acted["action"].shape, acted["gates"].shape, acted["primitives", "loc"].shape
+        (torch.Size([16, 17]), torch.Size([16, 8]), torch.Size([16, 8, 17]))
     """
     primitives = TensorDictModule(parts["primitives"], in_keys=[STATE], out_keys=list(PRIMITIVES))
     gate = (
@@ -140,8 +162,8 @@ def weights_actor(
 ) -> Actor:
     r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
 
-    The gate's logits are Gaussian, and the policy gradient uses their density. So the primitives have no gradient and
-    must be frozen.
+    The gate's logits are Gaussian, and the policy gradient uses the density of the logits. The primitives therefore get
+    no gradient and must be frozen.
 
     Args:
         parts: Made by :func:`composite_parts`.
@@ -152,6 +174,21 @@ def weights_actor(
 
     Raises:
         ValueError: If the primitives are not frozen.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.distributions import MultiplicativeGaussian
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.mcp import composite_parts, weights_actor
+        >>> from torchrl_mcp.modules import Gating, Primitives
+        >>> mixer = {"gate_activation": torch.nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+        >>> networks = {"gating": Gating, "primitives": Primitives, "num_primitives": 8, "initial_std": 0.1}
+        >>> parts = composite_parts(Sizes(observation=105, goal=2, action=17), **networks, **mixer)
+        >>> actor = weights_actor(parts, logits_std=0.5, frozen=["primitives"], **mixer)
+        >>> states = TensorDict({"observation": torch.randn(16, 105), "goal": torch.randn(16, 2)}, [16])
+        >>> actor.policy(states)["action"].shape, actor.sampled
+        (torch.Size([16, 17]), 'gate_logits')
     """
     require_frozen("primitives", frozen, over="weights")
     noise = parts["gate_noise"] if "gate_noise" in parts else ConstantScale(logits_std)
@@ -183,7 +220,7 @@ def random_weights(
 ) -> Explorer:
     """Return an explorer that composes the primitives with random weights, one set for each simulation.
 
-    It plays the composite's deterministic action.
+    The explorer plays the composite's deterministic action.
 
     Args:
         parts: Made by :func:`composite_parts`.
@@ -192,6 +229,9 @@ def random_weights(
         num_primitives: Number of primitives, ``K``.
         gate_activation: From logits to weights.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
+
+    Returns:
+        A function from normalised states ``(N, S)`` to actions ``(N, A)``.
     """
     # Paper: Gaussian weights. Here Gaussian logits, as with exploration=weights, so that weights are between 0 and 1.
     gates = gate_activation(torch.randn(num, num_primitives, generator=generator, device=generator.device))
@@ -208,7 +248,7 @@ class ConstantScale(nn.Module):
     """A standard deviation that does not depend on the input."""
 
     def __init__(self, std: float) -> None:
-        """Take the standard deviation, positive."""
+        """Set the standard deviation, which must be positive."""
         super().__init__()
         if not std > 0:
             raise ValueError(f"logits_std must be positive, got {std}")
@@ -223,7 +263,7 @@ class DeterministicAction(nn.Module):
     """The deterministic action of a composite."""
 
     def __init__(self, distribution_class: Composition) -> None:
-        """Take the mixer."""
+        """Set the mixer."""
         super().__init__()
         self.distribution_class = distribution_class
 

@@ -68,6 +68,9 @@ def option_critic_parts(
         values_cells: Hidden units of the critic.
         width: Factor on ``values_cells``.
         num_options: Number of options, ``K``.
+
+    Returns:
+        The parts by name.
     """
     return nn.ModuleDict(
         {
@@ -88,16 +91,35 @@ def option_critic_parts(
 def option_critic_actor(
     parts: nn.ModuleDict, *, num_options: int, epsilon: float, frozen: Collection[str] = ()
 ) -> Actor:
-    r"""Choose the option of highest value when none is held or the held one ends, and let it act.
+    r"""Choose the option of highest value at the beginning of an episode and when an option ends, and let it act.
 
-    Terminations stay random in deterministic interaction, because no threshold on :math:`\beta` would keep the rates at
-    which options change. Only the choice of the option and its action become deterministic.
+    Without exploration, the choice of the option and its action become deterministic, but terminations remain random,
+    because no threshold on :math:`\beta` would keep the rates at which options change.
 
     Args:
         parts: Made by :func:`option_critic_parts`.
         num_options: Number of options, ``K``.
         epsilon: Probability of a random choice.
         frozen: Names of the parts that do not change in training.
+
+    Example:
+        The environment must have the transform :class:`~torchrl_mcp.methods.transforms.OptionMemory`.
+
+        >>> from functools import partial
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts
+        >>> from torchrl_mcp.methods.options import Terminations
+        >>> from torchrl_mcp.methods.transforms import OptionMemory, TransformedCharacterEnv
+        >>> from torchrl_mcp.modules import Primitives
+        >>> networks = {"options": Primitives, "terminations": partial(Terminations, num_cells=[256], initial=0.1)}
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = option_critic_parts(sizes, **networks, values_cells=[256], num_options=8)
+        >>> actor = option_critic_actor(parts, num_options=8, epsilon=0.1)
+        >>> env = TransformedCharacterEnv(Heading("biped", num_envs=2, seed=0), OptionMemory())
+        >>> acted = env.rollout(3, actor.policy)
+        >>> acted["option"].shape, acted["terminations"].shape
+        (torch.Size([2, 3]), torch.Size([2, 3, 8]))
     """
     values = WhereBeginning(parts["critic"], num_options)
     drawn = sampler("option", partial(EpsilonGreedy, epsilon=epsilon), values="option_values")
@@ -128,6 +150,9 @@ def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:
     Args:
         parts: Made by :func:`option_critic_parts`, whose ``critic`` is :math:`Q_\Omega(s, g, \omega)`.
         sizes: Sizes of state, goal and action.
+
+    Returns:
+        The module. ``option_values`` and ``terminations`` have the shape ``(*B, K)``.
     """
     return TensorDictSequential(
         normalise_inputs(parts),
@@ -149,12 +174,12 @@ def random_sequence(
 
 
 def begins(terminations: Tensor, held_option: Tensor, held_steps: Tensor) -> Tensor:
-    """Draw whether an option begins, ``(*B)``, bool: it does if none is held or the held one ends.
+    """Draw whether an option begins, ``(*B)``, bool, which it does if there is no option yet or the option ends.
 
     Args:
         terminations: Probabilities with which options end, shape ``(*B, K)``.
         held_option: The option of the previous step, shape ``(*B)``.
-        held_steps: Steps for which that option has acted, 0 if there is none, shape ``(*B)``.
+        held_steps: Steps for which this option has acted, 0 if there is none, shape ``(*B)``.
     """
     ends = termination(terminations, held_option)
     return (held_steps == 0) | (torch.rand_like(ends) < ends)

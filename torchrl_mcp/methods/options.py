@@ -1,4 +1,4 @@
-"""Options: policies that do not see the goal, one of which acts at a time, chosen by a policy that sees the goal."""
+"""Options: policies that do not see the goal. One of them acts at a time, chosen by a policy that sees the goal."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,6 +19,15 @@ class SeparateOptions(nn.Module):
         action_dim: Size of the action, ``A``.
         num_options: Number of options, ``K``.
         policy: Makes the network of one option, such as the scratch model's, from ``(S, G, A)``, with ``G = 0``.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.methods.options import SeparateOptions
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> options = SeparateOptions(observation_dim=105, action_dim=17, num_options=7, policy=GaussianPolicy)
+        >>> loc, scale = options(torch.randn(16, 105), torch.randint(7, (16,)))
+        >>> loc.shape, scale.shape
+        (torch.Size([16, 17]), torch.Size([16, 17]))
     """
 
     def __init__(
@@ -48,10 +57,17 @@ class Terminations(nn.Module):
         num_options: Number of options, ``K``.
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
-        initial: Probability before training: an option lasts ``1 / initial`` steps on average.
+        initial: Probability before training. An option then lasts ``1 / initial`` steps on average.
 
     Raises:
-        ValueError: If ``initial`` is no probability between 0 and 1.
+        ValueError: If ``initial`` is not between 0 and 1.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.methods.options import Terminations
+        >>> terminations = Terminations(observation_dim=105, num_options=8, num_cells=[256], initial=0.1)
+        >>> terminations(torch.randn(16, 105)).shape
+        torch.Size([16, 8])
     """
 
     def __init__(
@@ -66,7 +82,7 @@ class Terminations(nn.Module):
         super().__init__()
         _require_options(num_options)
         if not 0 < initial < 1:
-            raise ValueError(f"initial={initial} is not a probability: pass a number between 0 and 1")
+            raise ValueError(f"initial={initial} must be a probability: pass a number between 0 and 1")
         num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
@@ -78,7 +94,7 @@ class Terminations(nn.Module):
 
 
 class WhereBeginning(nn.Module):
-    """Scores that are evaluated only where an option begins, and are zero elsewhere.
+    """Scores that are evaluated only for samples in which an option begins, and are zero for the others.
 
     Args:
         scores: From state ``(n, S)`` and goal ``(n, G)`` to ``(n, K)``.
@@ -104,7 +120,7 @@ class RandomSequence:
         num: Number of simulations, ``N``.
         generator: Source of randomness.
         num_options: Number of options, ``K``.
-        steps: Control steps for which each acts.
+        steps: Control steps for which each option acts.
     """
 
     def __init__(
@@ -130,7 +146,7 @@ class RandomSequence:
 
 
 class Choice(Categorical):
-    """A distribution over options. Numbers of options have no mean."""
+    """A distribution over options. It has no mean, because numbers of options are names."""
 
     @property
     def mean(self) -> NoReturn:
@@ -157,9 +173,11 @@ class EpsilonGreedy(Choice):
         epsilon: Probability :math:`\epsilon` of a random choice.
 
     Raises:
-        ValueError: If ``epsilon`` is no probability.
+        ValueError: If ``epsilon`` is not between 0 and 1.
 
     Example:
+        >>> import torch
+        >>> from torchrl_mcp.methods.options import EpsilonGreedy
         >>> EpsilonGreedy(torch.tensor([0.0, 2.0, 1.0, 0.0]), epsilon=0.2).probs
         tensor([0.0500, 0.8500, 0.0500, 0.0500])
     """
@@ -184,26 +202,38 @@ class EpsilonGreedy(Choice):
 
 
 def keep_option(begins: Tensor, drawn: Tensor, held: Tensor) -> Tensor:
-    """Return the options ``drawn`` where one begins and those ``held`` elsewhere, each ``(*B)``."""
+    """Return the options ``drawn`` where an option begins, and the options ``held`` elsewhere, each ``(*B)``."""
     return torch.where(begins, drawn, held)
 
 
 def of_option(values: Tensor, option: Tensor) -> Tensor:
-    """Select the values ``(*B, 1)`` of the options, ``(*B)`` or a single one, from those of all, ``(*B, K)``."""
+    """Select the values ``(*B, 1)`` of options, ``(*B)`` or a single one, from the values of all, ``(*B, K)``."""
     return values.gather(-1, option.unsqueeze(-1).expand(*values.shape[:-1], 1))
 
 
 def option_diagnostics(option: Tensor, begins: Tensor, num_options: int) -> dict[str, Tensor]:
-    """Summarise which options act and for how long: whether they collapsed into one, or switch at every step.
+    """Summarise which options act and for how long: whether one option does everything, or options switch all the time.
 
-    ``usage_k`` is the share of steps in which option k acts, ``effective_options`` the exponential of the entropy of
-    these shares: 1 if one option does everything. ``begin_rate`` is the share of steps in which an option begins,
-    at the start of an episode or after another has ended, and ``duration`` its inverse, the mean number of steps.
+    - ``usage_k`` is the share of steps in which option k acts.
+    - ``effective_options`` is the exponential of the entropy of these shares: 1 if one option does everything.
+    - ``begin_rate`` is the share of steps in which an option begins, at the start of an episode or after another.
+    - ``duration`` is the inverse of ``begin_rate``: the mean number of steps for which an option acts.
 
     Args:
         option: The option that acts, shape ``(*B)``, int64.
         begins: Whether it was chosen in this step, shape ``(*B)``, bool.
         num_options: Number of options, ``K``.
+
+    Returns:
+        The diagnostics by name, each a scalar.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.methods.options import option_diagnostics
+        >>> option, begins = torch.tensor([0, 0, 1, 1]), torch.tensor([True, False, True, False])
+        >>> report = option_diagnostics(option, begins, num_options=3)
+        >>> report["effective_options"], report["duration"]
+        (tensor(2.), tensor(2.))
     """
     usage = option.flatten().bincount(minlength=num_options) / option.numel()
     rate = begins.float().mean()

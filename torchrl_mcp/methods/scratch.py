@@ -15,6 +15,9 @@ def gaussian_parts(sizes: Sizes, *, policy: Callable[..., nn.Module]) -> nn.Modu
     Args:
         sizes: Sizes of state, goal and action.
         policy: Makes the network for mean and standard deviation from ``(S, G, A)``.
+
+    Returns:
+        The parts by name.
     """
     return nn.ModuleDict(
         {
@@ -30,6 +33,18 @@ def gaussian_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Act
     Args:
         parts: Made by :func:`gaussian_parts`.
         frozen: Names of the parts that do not change in training; the policy is still evaluated in full.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.scratch import gaussian_actor, gaussian_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> actor = gaussian_actor(gaussian_parts(Sizes(observation=105, goal=2, action=17), policy=GaussianPolicy))
+        >>> states = TensorDict({"observation": torch.randn(16, 105), "goal": torch.randn(16, 2)}, [16])
+        >>> acted = actor.policy(states)
+        >>> acted["action"].shape, acted["action_log_prob"].shape
+        (torch.Size([16, 17]), torch.Size([16]))
     """
     policy = ProbabilisticTensorDictSequential(
         normalise_inputs(parts),

@@ -16,12 +16,13 @@ from torchrl_mcp.methods.mcp import DeterministicAction
 
 @dataclass(frozen=True)
 class Act:
-    """A gate's turn.
+    """The turn of one gate in :class:`GatesInARow`.
 
     Attributes:
         parts: Parts of the policy, with ``observation_normaliser`` and ``primitives`` equal to those of the other acts.
-        until: Whether the act is over, ``(N,)``, bool, from the environment; None if it never is.
-        goal: Goals that the gate sees, ``(N, G)``, from the environment of another task; None for its own goals.
+        until: Returns from the environment whether the act is over, ``(N,)``, bool. If it is None, the act never ends.
+        goal: Returns from the environment the goals that the gate sees, ``(N, G)``. If it is None, the gate sees the
+            goals of the environment, which must be those of its own task.
     """
 
     parts: nn.ModuleDict
@@ -30,18 +31,17 @@ class Act:
 
 
 class GatesInARow(TensorDictModuleBase):
-    r"""A policy that plays acts one after another; in every simulation the last one stays.
+    r"""A policy that plays acts one after another. The last act goes on until the end of the episode.
 
-    The primitives are evaluated once for all gates. From one act to the next, the weights fade:
-    :math:`w = \sum_a \lambda_a w_a`, where the shares :math:`\lambda_a \ge 0` sum to one and change linearly in time.
-
-    An episode begins with the first act.
+    Each simulation changes acts at its own time, and each episode begins with the first act. From one act to the next,
+    the weights fade: :math:`w = \sum_a \lambda_a w_a`, where the shares :math:`\lambda_a \ge 0` sum to one and change
+    linearly in time. The primitives are evaluated once for all gates.
 
     Args:
         env: The environment that the policy plays in.
         acts: The acts.
         crossfade: Duration of a change of acts in seconds.
-        gate_activation: From logits to weights, that of the gates' training.
+        gate_activation: From logits to weights, as in the training of the gates.
         distribution_class: The mixer, of ``(loc, scale, gates)``.
 
     Raises:
@@ -50,6 +50,24 @@ class GatesInARow(TensorDictModuleBase):
 
     Attributes:
         act: Number of the act of each simulation, ``(N,)``.
+
+    Example:
+        A biped walks in a direction for a second, and then to a place.
+
+        >>> from torchrl_mcp.envs.tasks.waypoints import place_seen
+        >>> from torchrl_mcp.methods.sequence import Act, GatesInARow
+        >>> from torchrl_mcp.runs.builtin import builtin
+        >>> from torchrl_mcp.runs.policies import restore
+        >>> _, walk, env = restore(builtin("mcp", "biped", "heading"), num_envs=2, seed=0)
+        >>> _, arrive, _ = restore(builtin("mcp", "biped", "location"), num_envs=2, seed=0)
+        >>> place = torch.tensor([[2.0, 1.0]])  # metres
+        >>> acts = [
+        ...     Act(walk.parts, until=lambda env: env.episode["elapsed_steps"].squeeze(-1) >= 30),
+        ...     Act(arrive.parts, goal=lambda env: place_seen(env, place)),
+        ... ]
+        >>> policy = GatesInARow(env, acts)
+        >>> env.rollout(3, policy)["gates"].shape
+        torch.Size([2, 3, 8])
     """
 
     in_keys = ["observation", "goal"]  # noqa: RUF012, the interface of TensorDictModule
@@ -85,7 +103,7 @@ class GatesInARow(TensorDictModuleBase):
         return tensordict
 
     def _advance(self) -> None:
-        """Begin episodes with the first act, move on where an act is over, and fade."""
+        """Begin episodes with the first act, go to the next act when an act is over, and fade."""
         began = self.env.episode["elapsed_steps"].flatten() == 0
         never = torch.zeros_like(began)
         over = torch.stack([act.until(self.env) if act.until else never for act in self.acts])
@@ -101,15 +119,15 @@ class GatesInARow(TensorDictModuleBase):
 
 
 def _require_same(acts: Sequence[Act]) -> None:
-    """Check that acts have the same primitives.
+    """Check that there are acts, and that all acts have the same primitives.
 
     Raises:
         ValueError: If there are no acts, or their primitives or the normalisation of the state differ.
     """
     if not acts:
-        raise ValueError("there are no acts: pass at least one")
+        raise ValueError("acts is empty: pass at least one act")
     for number, act in enumerate(acts[1:], 1):
         for name in ("observation_normaliser", "primitives"):
             first, other = acts[0].parts[name].state_dict(), act.parts[name].state_dict()
             if first.keys() != other.keys() or any(not torch.equal(first[key], other[key]) for key in first):
-                raise ValueError(f"act {number} has another {name} than act 0: pass gates over the same primitives")
+                raise ValueError(f"act {number} must have the {name} of act 0: pass gates over the same primitives")

@@ -13,9 +13,16 @@ from torchrl.envs import Transform, TransformedEnv
 
 
 class TransformedCharacterEnv(TransformedEnv):
-    """Environments with transforms; the state of both can be set, saved and restored.
+    """Environments with transforms, where the state of both can be set, saved and restored.
 
-    TorchRL's own class saves the transforms alone, and does not pass a state for a reset on to the environments.
+    TorchRL's own class saves only the state of the transforms, and does not pass a given state on to the environments.
+
+    Example:
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.transforms import OptionMemory, TransformedCharacterEnv
+        >>> env = TransformedCharacterEnv(Heading("biped", num_envs=2, seed=0), OptionMemory())
+        >>> sorted(env.state_dict())
+        ['base_env', 'transform']
     """
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -38,11 +45,22 @@ class TransformedCharacterEnv(TransformedEnv):
 class OptionMemory(Transform):
     """A transform that adds the previous step's option, ``held_option``, and its duration in steps, ``held_steps``.
 
-    ``held_steps`` is 0 at the beginning of an episode, where no option is held. The policy writes ``option``, and
-    ``begins``, whether it has chosen the option in this step, each ``(N,)``. A policy that writes neither keeps the
-    held option.
+    Both have the shape ``(N,)``. ``held_steps`` is 0 at the beginning of an episode, when there is no option yet. The
+    policy writes ``option``, and ``begins``, which says whether it has chosen the option in this step, each ``(N,)``. A
+    policy that writes neither keeps the option of the previous step.
 
-    The memory is part of ``state_dict``: the next reset of all environments after loading returns to it.
+    The memory is part of ``state_dict``. After loading, the next reset of all environments returns to the saved memory.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.transforms import OptionMemory, TransformedCharacterEnv
+        >>> env = TransformedCharacterEnv(Heading("biped", num_envs=2, seed=0), OptionMemory())
+        >>> state = env.rand_action(env.reset())
+        >>> state["option"], state["begins"] = torch.tensor([3, 5]), torch.tensor([True, True])
+        >>> after = env.step(state)["next"]
+        >>> after["held_option"], after["held_steps"]
+        (tensor([3, 5]), tensor([1, 1]))
     """
 
     def __init__(self) -> None:
@@ -55,7 +73,7 @@ class OptionMemory(Transform):
         return _with_integers(observation_spec, "held_option", "held_steps")
 
     def get_extra_state(self) -> dict[str, Tensor]:
-        """Return held option and steps."""
+        """Return the options and their durations."""
         return {key: value.clone() for key, value in self._held.items()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -84,10 +102,10 @@ class ClipAsOption(Transform):
     """A transform that adds the index of the reference motion as ``option``, so that each option imitates one clip.
 
     Args:
-        num_options: Number of options, and of the reference motions.
+        num_options: Number of options, which is the number of reference motions.
 
     Raises:
-        ValueError: If it is attached to an environment with another number of reference motions.
+        ValueError: If the environment has another number of reference motions.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
@@ -102,8 +120,8 @@ class ClipAsOption(Transform):
         library = getattr(self.parent, "library", ())
         if len(library) != self.num_options:
             raise ValueError(
-                f"num_options={self.num_options} primitives need as many reference motions, one each, and there are "
-                f"{len(library)}: pre-train with task=imitation and motions of that number, such as motions=turning"
+                f"num_options={self.num_options} must be the number of reference motions, which is {len(library)}: "
+                "pre-train with task=imitation and as many motions, such as motions=turning"
             )
         return _with_integers(observation_spec, "option")
 
@@ -117,7 +135,7 @@ class ClipAsOption(Transform):
 def _with_integers(spec: TensorSpec, *names: str) -> TensorSpec:
     """Return the spec with an entry for each name, of one integer per environment."""
     if not isinstance(spec, Composite):
-        raise TypeError(f"the environment observes {spec}, which has no names: a Composite is needed")
+        raise TypeError(f"the environment observes {spec}, which has no names: pass one whose spec is a Composite")
     for name in names:
         spec[name] = Unbounded(shape=spec.shape, device=spec.device, dtype=torch.int64)
     return spec

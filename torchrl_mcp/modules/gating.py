@@ -10,8 +10,8 @@ from torchrl.modules import MLP
 class Gating(nn.Module):
     r"""Gate logits from state and goal: the left half of Figure 3, up to the output activation.
 
-    State and goal are encoded by separate networks whose features are concatenated and processed by one more layer.
-    The activation that turns logits into weights, a sigmoid in the paper, is a separate module, because
+    Two networks encode state and goal separately. Their features are concatenated and pass through one more layer.
+    The activation that turns logits into weights, a sigmoid in the paper, is not part of this module, because
     exploration over weights samples the logits.
 
     Args:
@@ -27,6 +27,14 @@ class Gating(nn.Module):
     Reference:
         Peng et al., *MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies*,
         NeurIPS 2019, Figure 3. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import Gating
+        >>> gating = Gating(observation_dim=105, goal_dim=2, num_primitives=8)
+        >>> gates = gating(torch.randn(16, 105), torch.randn(16, 2)).sigmoid()
+        >>> gates.shape
+        torch.Size([16, 8])
     """
 
     def __init__(
@@ -69,6 +77,14 @@ class JointGating(nn.Module):
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Sections E.4 and E.6. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import JointGating
+        >>> gating = JointGating(observation_dim=105, goal_dim=2, num_primitives=8)
+        >>> gates = gating(torch.randn(16, 105), torch.randn(16, 2)).softmax(-1)
+        >>> gates.sum(-1).allclose(torch.ones(16))
+        True
     """
 
     def __init__(
@@ -95,10 +111,10 @@ def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
     """Return numbers of hidden units times ``width``, rounded.
 
     Raises:
-        ValueError: If they are no list of layers, or a layer would have no units.
+        ValueError: If ``num_cells`` is not a list of layers, or a layer would have no units.
     """
     if isinstance(num_cells, int) or not num_cells:
-        raise ValueError(f"num_cells={num_cells} must be a list with the units of at least one layer, such as [64]")
+        raise ValueError(f"num_cells={num_cells} must be a list with the units of one layer or more, such as [64]")
     scaled = [round(cells * width) for cells in num_cells]
     if min(scaled) < 1:
         raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")
@@ -131,11 +147,27 @@ def scaled_linear(in_features: int, out_features: int, gain: float) -> nn.Linear
 
 
 def gate_diagnostics(gates: Tensor, saturation: float = 0.05) -> dict[str, Tensor]:
-    r"""Summarise gates ``(*B, K)`` as scalars: whether primitives share the work, and whether gates are saturated.
+    r"""Summarise gates as scalars: whether primitives share the work, and whether gates are saturated.
 
-    ``sum`` is :math:`\sum_k w_k`, which divides the composite variance. ``saturation`` is the fraction of gates within
-    ``saturation`` of 0 or 1, where a sigmoid hardly learns. ``entropy`` (nats) and ``effective_primitives``, its
-    exponential, describe the normalised weights. ``usage_k`` is the mean weight of primitive k.
+    - ``sum`` is the mean of :math:`\sum_k w_k`, which divides the composite variance.
+    - ``saturation`` is the share of gates near 0 or 1, where a sigmoid hardly learns.
+    - ``entropy`` is the mean entropy of the normalised weights, in nats.
+    - ``effective_primitives`` is the mean of its exponential: K for equal gates, 1 if only one gate is open.
+    - ``usage_k`` is the mean weight of primitive k, counted from 0.
+
+    Args:
+        gates: Weights, shape ``(*B, K)``.
+        saturation: Distance from 0 or 1 within which a gate counts as saturated.
+
+    Returns:
+        The diagnostics by name, each a scalar.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import gate_diagnostics
+        >>> report = gate_diagnostics(torch.tensor([[1.0, 0.0], [0.5, 0.5]]))
+        >>> report["effective_primitives"], report["saturation"], report["usage_0"]
+        (tensor(1.5000), tensor(0.5000), tensor(0.7500))
     """
     gates = gates.detach().float().reshape(-1, gates.shape[-1])
     share = gates / gates.sum(-1, keepdim=True).clamp_min(torch.finfo(gates.dtype).tiny)

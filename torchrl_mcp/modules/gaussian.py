@@ -14,9 +14,9 @@ LEAST_STD = 1e-4
 
 
 class GaussianPolicy(nn.Module):
-    r"""A network for the mean, and a covariance without one: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
+    r"""A network for the mean of an action: :math:`\mathcal{N}(\mu(s, g), \mathrm{diag}(\sigma^2))`.
 
-    The standard deviation is the same in all states. The paper fixes it; if it is learned, it can shrink when
+    The standard deviation is the same in all states. The paper fixes it. A learned standard deviation can shrink when
     noise limits the reward.
 
     Args:
@@ -34,6 +34,14 @@ class GaussianPolicy(nn.Module):
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.2. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> policy = GaussianPolicy(observation_dim=105, goal_dim=2, action_dim=17, std=0.1)
+        >>> loc, scale = policy(torch.randn(16, 105), torch.randn(16, 2))
+        >>> loc.shape, scale.shape, scale[0, 0].item()
+        (torch.Size([16, 17]), torch.Size([16, 17]), 0.1)
     """
 
     def __init__(
@@ -80,7 +88,7 @@ def restart_noise(network: nn.Module, std: float) -> None:
 def state_independent_scale(
     std: float | Sequence[float], action_dim: int, learned: bool
 ) -> AddStateIndependentNormalScale:
-    """Return the module that adds standard deviations, from one for all actions or one each, to means ``(*B, A)``.
+    """Return the module that adds standard deviations, one for all actions or one each, to means ``(*B, A)``.
 
     Raises:
         ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.

@@ -1,4 +1,4 @@
-"""A policy network whose output does not change when it gets new inputs."""
+"""A policy network that gets new inputs without a change of its output."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,9 @@ from torchrl_mcp.modules.gaussian import state_independent_scale
 
 
 class InputInjection(nn.Linear):
-    """Weights ``(H, G)`` from G new inputs to H hidden units; they start at zero, so that the output stays the same.
+    """Weights ``(H, G)`` from G new inputs to H hidden units, which start at zero.
+
+    Because of the zeros, a network has the same output before and after it gets the new inputs.
 
     Args:
         in_features: Number of new inputs, ``G``.
@@ -18,6 +20,13 @@ class InputInjection(nn.Linear):
     Reference:
         Berseth et al., *Progressive Reinforcement Learning with Distillation for Multi-Skilled Motion Control*,
         ICLR 2018. https://arxiv.org/abs/1802.04765
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import InputInjection
+        >>> injection = InputInjection(in_features=2, out_features=512)
+        >>> injection(torch.randn(16, 2)).abs().max()
+        tensor(0., grad_fn=<MaxBackward1>)
     """
 
     def __init__(self, in_features: int, out_features: int) -> None:
@@ -30,8 +39,8 @@ class InjectedPolicy(nn.Module):
 
     .. math:: \mu = W_3 \operatorname{relu}(W_2 \operatorname{relu}(W_1 s + b_1 + j) + b_2) + b_3
 
-    The injection :math:`j = J g` comes from :class:`InputInjection`. It is added rather than concatenated because a
-    matrix product over more columns rounds differently, even if they are zero.
+    The injection :math:`j = J g` comes from :class:`InputInjection`. The goal is added rather than concatenated,
+    because a matrix product over more columns rounds differently, even if the columns are zero.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -47,6 +56,15 @@ class InjectedPolicy(nn.Module):
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.3. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import InjectedPolicy, InputInjection
+        >>> policy = InjectedPolicy(observation_dim=105, action_dim=17, num_cells=(1024, 512))
+        >>> injection = InputInjection(in_features=2, out_features=1024)  # from the goal to the first layer
+        >>> loc, scale = policy(torch.randn(16, 105), injection(torch.randn(16, 2)))
+        >>> loc.shape, scale.shape
+        (torch.Size([16, 17]), torch.Size([16, 17]))
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Encoders of the latent space model: from goals to distributions over skills."""
+"""Encoders of the latent space model: from goals to distributions of a latent variable."""
 
 from collections.abc import Sequence
 
@@ -19,6 +19,14 @@ class StateGoalEncoder(nn.Module):
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import StateGoalEncoder
+        >>> encoder = StateGoalEncoder(observation_dim=105, goal_dim=2, latent_dim=16)
+        >>> loc, scale = encoder(torch.randn(32, 105), torch.randn(32, 2))
+        >>> loc.shape, scale.shape
+        (torch.Size([32, 16]), torch.Size([32, 16]))
     """
 
     def __init__(
@@ -45,7 +53,28 @@ class StateGoalEncoder(nn.Module):
 
 
 class GoalEncoder(StateGoalEncoder):
-    """The encoder of pre-training, :math:`q(w|g)`, with the same arguments, which does not look at the state."""
+    r"""The encoder of pre-training, :math:`q(w|g)`, which does not see the state.
+
+    The arguments are those of :class:`StateGoalEncoder`, so that one can replace the other.
+
+    Args:
+        observation_dim: Size of the state, ``S``; not used.
+        goal_dim: Size of the goal, ``G``.
+        latent_dim: Size of the latent variable, ``L``.
+        num_cells: Hidden units.
+        width: Factor on all numbers of hidden units.
+
+    Reference:
+        Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import GoalEncoder
+        >>> encoder = GoalEncoder(observation_dim=105, goal_dim=210, latent_dim=16)
+        >>> loc, scale = encoder(torch.randn(32, 105), torch.randn(32, 210))
+        >>> loc.shape, scale.shape
+        (torch.Size([32, 16]), torch.Size([32, 16]))
+    """
 
     def __init__(
         self,

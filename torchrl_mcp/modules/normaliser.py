@@ -11,13 +11,14 @@ LARGEST = 1e5
 
 
 class RunningNormaliser(nn.Module):
-    r"""Standardise inputs by running statistics, then clip them.
+    r"""Standardise inputs by running statistics, and clip the result.
 
     .. math:: y = \operatorname{clip}\left(\frac{x - m}{\sqrt{v + \epsilon}}, -c, c\right)
 
-    The statistics are buffers that :meth:`update` changes in place, once per training iteration, so that the samples of
-    an iteration and the loss on them see the same numbers. A loss that copies a network, as
-    :class:`torchrl.objectives.SACLoss` does with its critics, does not see later updates: normalise before it.
+    The mean :math:`m` and the variance :math:`v` are buffers, which :meth:`update` changes in place. Call it once per
+    training iteration, so that the samples of an iteration and the loss on these samples see the same numbers. A loss
+    that copies a network, as :class:`torchrl.objectives.SACLoss` copies its critics, does not see later updates:
+    normalise inputs before such a loss.
 
     Args:
         size: Number of input features, ``F``.
@@ -28,6 +29,8 @@ class RunningNormaliser(nn.Module):
         ValueError: If ``size`` or ``clip`` is not positive.
 
     Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import RunningNormaliser
         >>> normaliser = RunningNormaliser(2)
         >>> normaliser.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
         >>> normaliser(torch.tensor([1.0, 30.0]))
@@ -51,7 +54,7 @@ class RunningNormaliser(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def count_each(self) -> None:
-        """Count the samples of each feature by itself, ``(F,)``, so that some can begin anew."""
+        """Count the samples of each feature separately, ``(F,)``, so that single features can begin anew."""
         self.count.data = self.count.expand_as(self.mean).clone()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -67,8 +70,8 @@ class RunningNormaliser(nn.Module):
     def update(self, x: Tensor) -> None:
         """Merge the samples ``x``, shape ``(*B, F)``, into the statistics.
 
-        Samples with a feature that is not finite or beyond ``LARGEST`` are left out with a warning, because a single
-        one would outweigh all earlier samples.
+        A sample with a feature that is not finite or exceeds ``LARGEST`` is left out with a warning, because one such
+        sample would outweigh all earlier samples.
 
         Raises:
             ValueError: If ``x`` has another number of features.
@@ -101,7 +104,7 @@ class RunningNormaliser(nn.Module):
             raise ValueError(f"x is {tuple(x.shape)}: its last dimension must have {len(self.mean)} features")
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Take statistics with one count, or with one of each feature."""
+        """Load statistics with one count for all features or with one count for each feature."""
         if (count := state_dict.get(f"{prefix}count")) is not None:
             self.count.data = self.count.new_zeros(count.shape)
         super()._load_from_state_dict(state_dict, prefix, *args)

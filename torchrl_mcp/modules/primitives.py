@@ -12,9 +12,9 @@ from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
 class Primitives(nn.Module):
     r"""K Gaussian primitives :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` on one shared trunk.
 
-    The trunk is followed by one hidden layer and one linear output layer per primitive, as in Figure 3, or by the
-    linear layers alone, as in the mixture of experts. The separate layers of all primitives are evaluated together, as
-    batched matrix products.
+    After the trunk, each primitive has one hidden layer and one linear output layer of its own, as in Figure 3. With
+    ``branch_cells=0``, each primitive has a linear layer only, as in the mixture of experts. The layers of all
+    primitives are evaluated together, as batched matrix products.
 
     Args:
         observation_dim: Size of the state, ``S``.
@@ -25,15 +25,23 @@ class Primitives(nn.Module):
         width: Factor on all numbers of hidden units.
         initial_std: Standard deviation of every primitive before training, in action units.
         output_gain: Factor on the initial weights of the output layers; small values start all primitives alike.
-        std_gain: Factor on the output layer for :math:`\log \sigma`. Adam moves every weight by about its step size, so
-            that with a factor of 1 the noise changes many times as fast as a :math:`\log \sigma` that is a parameter
-            itself; smaller factors slow it down.
+        std_gain: Factor on the output layer for :math:`\log \sigma`. Adam moves every weight by about its step size.
+            With a factor of 1, :math:`\log \sigma` therefore changes many times as fast as if it were a parameter;
+            smaller factors slow this down.
 
     Raises:
         ValueError: If ``num_primitives``, ``initial_std`` or ``std_gain`` is not positive.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Figure 3, Eq. 4 and Section E.6. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.modules import Primitives
+        >>> primitives = Primitives(observation_dim=105, action_dim=17, num_primitives=8)
+        >>> loc, scale = primitives(torch.randn(16, 105))
+        >>> loc.shape, scale.shape
+        (torch.Size([16, 8, 17]), torch.Size([16, 8, 17]))
     """
 
     def __init__(
@@ -85,7 +93,7 @@ class Primitives(nn.Module):
 
 
 class BatchedLinear(nn.Module):
-    """K linear layers side by side: ``(*B, K, I)``, or ``(*B, 1, I)`` shared by all, to ``(*B, K, O)``.
+    """K linear layers side by side, from ``(*B, K, I)``, or ``(*B, 1, I)`` for all layers, to ``(*B, K, O)``.
 
     Args:
         num_layers: Number of layers, ``K``.

@@ -1,4 +1,7 @@
-"""Losses and estimators that TorchRL does not have."""
+"""Losses and estimators of advantages that TorchRL lacks.
+
+An estimator takes trajectories ``(N, T)`` and adds its estimates. A loss takes samples ``(B,)`` and returns scalars.
+"""
 
 from torchrl_mcp.objectives.actor_loss import ActorLoss
 from torchrl_mcp.objectives.advantages import Advantages

@@ -12,12 +12,12 @@ from torchrl.objectives.value import GAE
 class Advantages:
     r"""GAE(:math:`\lambda`) with TD(:math:`\lambda`) value targets, bootstrapped at time limits.
 
-    The critic sees every state once: the value of a next state is the value of the following sample. After a time limit
-    and at the end of the batch, no sample of the same episode follows, and the critic evaluates the stored next
-    observation. A terminated episode has no value beyond its end.
+    The critic evaluates every state once, because the value of a next state is the value of the following sample. After
+    a time limit and at the end of the batch, no sample of the same episode follows: there the critic evaluates the
+    stored next observation. After its end, a terminated episode has the value 0.
 
-    Rewards are scaled by :math:`1 - \gamma` first, so that returns have the size of a reward and the critic's outputs
-    are of order one for any discount.
+    Rewards are multiplied by :math:`1 - \gamma` first. Returns therefore have the size of a reward, and the outputs of
+    the critic are of order one for any discount factor.
 
     Args:
         critic: From keys of a state, such as ``observation`` and ``goal``, to ``state_value``.
@@ -30,6 +30,17 @@ class Advantages:
 
     Reference:
         Schulman et al., *High-Dimensional Continuous Control Using Generalized Advantage Estimation*, 2016.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.objectives import Advantages
+        >>> critic = ValueOperator(torch.nn.Linear(105, 1), in_keys=["observation"])
+        >>> advantages = Advantages(critic, gamma=0.99, lmbda=0.95, clip=4.0)
+        >>> batch = advantages(Heading("biped", num_envs=4, seed=0).rollout(8))
+        >>> batch["advantage"].shape, batch["value_target"].shape
+        (torch.Size([4, 8, 1]), torch.Size([4, 8, 1]))
     """
 
     out_keys = ("advantage", "value_target")
@@ -66,7 +77,7 @@ class ScaledGAE:
         self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
     def __call__(self, batch: TensorDictBase, value: Tensor, next_value: Tensor) -> tuple[Tensor, Tensor]:
-        """Return advantages and targets of values of trajectories ``(*B, T)``, like the values ``(*B, T, 1)`` each."""
+        """Return advantages and targets of values, each ``(*B, T, 1)``, for trajectories ``(*B, T)`` with values."""
         trajectories = batch.select(("next", "done"), ("next", "terminated"))
         trajectories["state_value"] = value
         trajectories["next", "state_value"] = next_value
@@ -78,9 +89,9 @@ class ScaledGAE:
 def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[TensorDictBase], Tensor]) -> Tensor:
     """Return values of the states in which the steps of trajectories end, ``(*B, T, F)``.
 
-    They are those of the following samples. After the end of an episode that is not terminated, such as a time limit,
-    and at the end of the batch, no sample of the same episode follows, and the stored next state is evaluated. After a
-    terminated episode they have no meaning.
+    The value after a step is the value of the following sample. After an episode that ends without being terminated,
+    for example by a time limit, and at the end of the batch, no sample of the same episode follows: there the stored
+    next state is evaluated. After a terminated episode the values have no meaning.
 
     Args:
         values: Values of the states in which the steps begin, ``(*B, T, F)``.
@@ -96,7 +107,7 @@ def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[Tens
 
 
 def normalised(advantage: Tensor, clip: float) -> Tensor:
-    """Scale advantages of a batch to zero mean and unit variance, and clip them; a single one becomes 0."""
+    """Scale advantages of a batch to zero mean and unit variance, and clip them; a single advantage becomes 0."""
     deviation = advantage.std(correction=min(1, advantage.numel() - 1))
     return ((advantage - advantage.mean()) / deviation.clamp_min(1e-8)).clamp(-clip, clip)
 

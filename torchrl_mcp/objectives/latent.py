@@ -1,4 +1,4 @@
-"""PPO's loss with the latent space model's regulariser."""
+"""PPO's loss with the regulariser of the latent space model."""
 
 from typing import Any
 
@@ -13,14 +13,14 @@ from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 
 
 class LatentPPOLoss(BoundedClipPPOLoss):
-    r"""The bounded PPO loss plus a penalty on latent codes with much information about the goal.
+    r"""The bounded PPO loss plus a penalty on latent variables that carry much information about the goal.
 
     .. math:: L + \beta \, \mathbb{E} \, D_{KL}\left[ q(w|g) \,\|\, \mathcal{N}(0, I) \right]
 
-    The paper's Eq. 12 maximises return *plus* this divergence, which would reward its growth; a regulariser is
-    subtracted from the return, hence added to the loss. Eq. 12 is stated for policy and encoder together, hence for
-    pre-training, but Table 11 has one :math:`\beta` for both stages, whereas its step sizes differ by stage. Here the
-    penalty acts in both, on :math:`q(w|s, g)` at transfer.
+    The paper's Eq. 12 maximises the return *plus* this divergence, which would reward its growth. A regulariser is
+    subtracted from the return, that is, added to the loss. Eq. 12 is about policy and encoder together and hence about
+    pre-training, but Table 11 has one :math:`\beta` for both stages, whereas its step sizes differ by stage. We use
+    the penalty in both stages; at transfer it concerns :math:`q(w|s, g)`.
 
     Args:
         actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
@@ -30,6 +30,24 @@ class LatentPPOLoss(BoundedClipPPOLoss):
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Eq. 12. https://arxiv.org/abs/1905.09808
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.latent_space import latent_actor, latent_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy, StateGoalEncoder
+        >>> from torchrl_mcp.objectives import LatentPPOLoss
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = latent_parts(sizes, encoder=StateGoalEncoder, decoder=GaussianPolicy, latent_dim=16)
+        >>> actor = latent_actor(parts)
+        >>> with torch.no_grad():
+        ...     samples = Heading("biped", num_envs=4, seed=0).rollout(8, actor.policy).reshape(-1)
+        >>> samples["advantage"] = torch.randn(32, 1)
+        >>> loss = LatentPPOLoss(actor.trained, kl_coeff=1e-4, bound_coeff=10.0, entropy_bonus=False)
+        >>> report = loss(samples)
+        >>> sorted(name for name in report.keys() if name.startswith("loss_"))
+        ['loss_bound', 'loss_latent', 'loss_objective']
     """
 
     def __init__(

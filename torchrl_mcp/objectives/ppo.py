@@ -15,19 +15,40 @@ class BoundedClipPPOLoss(ClipPPOLoss):
 
     .. math:: L = L^{\mathrm{clip}} + c \, \mathbb{E} \sum_j \max(0, |\mu_j| - b)^2
 
-    The environment clips actions to the bounds, so without the penalty nothing pulls such means back.
+    The environment clips actions to the bounds. Without the penalty, nothing would therefore pull a mean action outside
+    the bounds back.
 
     Args:
         actor_network: The policy.
         critic_network: The value function, or None if it has its own loss.
-        bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean. Of a mixture the mean counts,
-            which may lie inside while means of primitives do not.
+        bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean. For a mixture, the penalty
+            concerns the mean of the mixture, which may be inside the bounds even if means of primitives are not.
         bound: Largest absolute mean action, :math:`b`.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
 
     Reference:
         Peng et al., *DeepMimic: Example-Guided Deep Reinforcement Learning of Physics-Based Character Skills*, 2018,
         whose code bounds actions in this way; the MCP paper does not mention it.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.critic import value_critic
+        >>> from torchrl_mcp.methods.scratch import gaussian_actor, gaussian_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> from torchrl_mcp.objectives import Advantages, BoundedClipPPOLoss
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = gaussian_parts(sizes, policy=GaussianPolicy)
+        >>> actor, critic = gaussian_actor(parts), value_critic(parts, sizes)
+        >>> env = Heading("biped", num_envs=4, seed=0)
+        >>> with torch.no_grad():
+        ...     batch = env.rollout(8, actor.policy)
+        >>> samples = Advantages(critic, gamma=0.99, lmbda=0.95, clip=4.0)(batch).reshape(-1)
+        >>> loss = BoundedClipPPOLoss(actor.trained, bound_coeff=10.0, clip_epsilon=0.2, entropy_bonus=False)
+        >>> report = loss(samples)
+        >>> sorted(name for name in report.keys() if name.startswith("loss_"))
+        ['loss_bound', 'loss_objective']
     """
 
     def __init__(

@@ -11,18 +11,17 @@ from torchrl_mcp.objectives.advantages import normalised, reward_scale, upon_arr
 class SemiMarkovAdvantages:
     r"""GAE(:math:`\lambda`) and TD(:math:`\lambda`) targets for choices that last several steps.
 
-    A choice in state s that lasts k steps, the last of which leads to s', has the advantage
+    A choice in state s that lasts k steps and leads to the state s' has the advantage
 
     .. math::
         A = \sum_{i=0}^{k-1} \gamma^i r_i + \gamma^k V(s') - V(s) + \gamma^k \lambda A'
 
-    where :math:`A'` is the advantage of the choice that follows. A terminated episode has no value beyond its end.
-    After a time limit and at the end of the batch no choice follows: V of the last state is used, even if the choice
-    would have lasted longer. A batch should be much longer than a choice.
+    where :math:`A'` is the advantage of the next choice. After its end, a terminated episode has the value 0. After a
+    time limit and at the end of the batch there is no next choice: there the value of the last state is used, even if
+    the choice would have lasted longer. A batch should therefore be much longer than a choice.
 
-    Steps before the first choice of a batch belong to a choice of the batch before, and are not used.
-
-    Rewards are scaled by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`.
+    Steps before the first choice of a batch belong to a choice of the batch before and are not used. Rewards are
+    multiplied by :math:`1 - \gamma`, as in :class:`~torchrl_mcp.objectives.Advantages`.
 
     Args:
         critic: From keys of a state, such as ``observation`` and ``goal``, to ``state_value``.
@@ -36,6 +35,20 @@ class SemiMarkovAdvantages:
     Reference:
         Sutton, Precup and Singh, *Between MDPs and semi-MDPs: A framework for temporal abstraction in reinforcement
         learning*, 1999. https://doi.org/10.1016/S0004-3702(99)00052-1
+
+    Example:
+        A choice every fourth step:
+
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.objectives import SemiMarkovAdvantages
+        >>> critic = ValueOperator(torch.nn.Linear(105, 1), in_keys=["observation"])
+        >>> advantages = SemiMarkovAdvantages(critic, gamma=0.99, lmbda=0.95, clip=4.0)
+        >>> batch = Heading("biped", num_envs=2, seed=0).rollout(8)
+        >>> batch["begins"] = (torch.arange(8) % 4 == 0).expand(2, 8)
+        >>> advantages(batch)["advantage"].shape  # two choices in each of two trajectories
+        torch.Size([4, 1])
     """
 
     out_keys = ("advantage", "value_target")
@@ -49,7 +62,7 @@ class SemiMarkovAdvantages:
         """Return the C choices of trajectories ``(*B, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
 
         Raises:
-            ValueError: If the trajectories hold no choice.
+            ValueError: If the trajectories contain no choice.
         """
         begins = batch["begins"]
         if not begins.any():

@@ -1,4 +1,4 @@
-"""Left-right symmetry in learning: a symmetric character can walk with left and right exchanged."""
+"""Learning with mirror images: a symmetric character can do everything with left and right exchanged."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,15 +15,15 @@ class MirroredSamples:
     """Advantages of samples, with a random half of every batch replaced by mirror images.
 
     The mirror image of a sample has the mirrored state, goal and action, and the same advantage. Its log-probability is
-    computed with the current policy, so that the first ratio of PPO is one. The number of samples stays the same.
+    computed with the current policy, so that the first ratio of PPO is one.
 
-    A policy that is not symmetric may find an image all but impossible. The gradient of its log-probability is then so
-    large that learning diverges, so such a sample is not replaced.
+    A policy that is not symmetric may give an image almost no probability. The gradient of the log-probability would
+    then be so large that learning diverges, so that such a sample is not replaced.
 
     Args:
-        advantages: Estimates advantages of trajectories ``(N, T)``.
+        advantages: Estimates advantages of trajectories ``(N, T)``, such as :class:`.Advantages`.
         actor: The actor.
-        mirrors: Reflections of ``observation``, ``goal`` and ``action``.
+        mirrors: Reflections of ``observation``, ``goal`` and ``action``, which the environment's ``mirrors()`` returns.
         tolerance: How much less likely than the sample its image may be, as a difference of log-probabilities in nats.
 
     Raises:
@@ -32,6 +32,25 @@ class MirroredSamples:
     Reference:
         Abdolhosseini et al., *On Learning Symmetric Locomotion*, 2019, which adds the images to the samples (DUP).
         https://doi.org/10.1145/3359566.3360070
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.critic import value_critic
+        >>> from torchrl_mcp.methods.scratch import gaussian_actor, gaussian_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> from torchrl_mcp.objectives import Advantages, MirroredSamples
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = gaussian_parts(sizes, policy=GaussianPolicy)
+        >>> actor, critic = gaussian_actor(parts), value_critic(parts, sizes)
+        >>> env = Heading("biped", num_envs=4, seed=0)
+        >>> with torch.no_grad():
+        ...     batch = env.rollout(8, actor.policy)
+        >>> advantages = Advantages(critic, gamma=0.99, lmbda=0.95, clip=4.0)
+        >>> mirrored = MirroredSamples(advantages, actor, env.mirrors())
+        >>> mirrored(batch)["advantage"].shape
+        torch.Size([4, 8, 1])
     """
 
     def __init__(
@@ -64,14 +83,14 @@ class MirroredSamples:
 
 
 class SymmetryLoss(ActorLoss):
-    r"""An actor's loss plus a penalty on mean actions that are not the mirror images of those in mirrored states.
+    r"""An actor's loss plus a penalty on actions that differ from the mirror images of actions in mirrored states.
 
     .. math:: L + c \, \mathbb{E} \left\| \mu(s, g) - M_a \, \mu(M_s s, M_g g) \right\|^2
 
     Args:
         loss: The actor's loss.
         actor: The actor.
-        mirrors: Reflections of ``observation``, ``goal`` and ``action``.
+        mirrors: Reflections of ``observation``, ``goal`` and ``action``, which the environment's ``mirrors()`` returns.
         coeff: Weight of the penalty, :math:`c`.
 
     Raises:
@@ -79,6 +98,26 @@ class SymmetryLoss(ActorLoss):
 
     Reference:
         Yu, Turk and Liu, *Learning Symmetric and Low-Energy Locomotion*, 2018, Eq. 4. https://arxiv.org/abs/1801.08093
+
+    Example:
+        >>> import torch
+        >>> from torchrl_mcp.envs import Heading
+        >>> from torchrl_mcp.methods.actor import Sizes
+        >>> from torchrl_mcp.methods.critic import value_critic
+        >>> from torchrl_mcp.methods.scratch import gaussian_actor, gaussian_parts
+        >>> from torchrl_mcp.modules import GaussianPolicy
+        >>> from torchrl_mcp.objectives import Advantages, BoundedClipPPOLoss, SymmetryLoss
+        >>> sizes = Sizes(observation=105, goal=2, action=17)
+        >>> parts = gaussian_parts(sizes, policy=GaussianPolicy)
+        >>> actor, critic = gaussian_actor(parts), value_critic(parts, sizes)
+        >>> env = Heading("biped", num_envs=4, seed=0)
+        >>> with torch.no_grad():
+        ...     batch = env.rollout(8, actor.policy)
+        >>> samples = Advantages(critic, gamma=0.99, lmbda=0.95, clip=4.0)(batch).reshape(-1)
+        >>> ppo = BoundedClipPPOLoss(actor.trained, bound_coeff=10.0, clip_epsilon=0.2, entropy_bonus=False)
+        >>> report = SymmetryLoss(ppo, actor, env.mirrors(), coeff=4.0)(samples)
+        >>> sorted(name for name in report.keys() if name.startswith("loss_"))
+        ['loss_bound', 'loss_objective', 'loss_symmetry']
     """
 
     def __init__(self, loss: ActorLoss, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:

@@ -11,12 +11,22 @@ class ValueLoss(nn.Module):
 
     .. math:: L = c \, \mathbb{E} \, (V(s, g) - y)^2
 
-    This is the ``loss_critic`` of TorchRL's PPO with ``loss_critic_type="l2"``, without the actor's terms, so that
+    This is the ``loss_critic`` of TorchRL's PPO with ``loss_critic_type="l2"``. It has no terms of the actor, so that
     actor and critic can learn at the same time.
 
     Args:
-        critic_network: From ``observation`` and ``goal`` to ``state_value``.
+        critic_network: From ``observation`` and ``goal`` to ``state_value``, ``(B, 1)``.
         coeff: Weight of the error, :math:`c`.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl_mcp.objectives import ValueLoss
+        >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
+        >>> samples = TensorDict({"observation": torch.randn(16, 3), "value_target": torch.zeros(16, 1)}, [16])
+        >>> sorted(ValueLoss(critic, coeff=1.0)(samples).keys())
+        ['explained_variance', 'loss_critic']
     """
 
     def __init__(self, critic_network: TensorDictModuleBase, *, coeff: float) -> None:
@@ -31,8 +41,8 @@ class ValueLoss(nn.Module):
         """
         target, values = tensordict["value_target"], self._values(tensordict)
         if target.shape != values.shape:
-            shapes = f"{tuple(target.shape)}, and values are {tuple(values.shape)}"
-            raise ValueError(f"value_target is {shapes}: give both one shape, such as with unsqueeze(-1)")
+            shapes = f"shape {tuple(target.shape)}, but values have {tuple(values.shape)}"
+            raise ValueError(f"value_target has {shapes}: give both the same shape, for example by unsqueeze(-1)")
         residual = target - values
         with torch.no_grad():
             explained = 1 - residual.var(correction=0) / target.var(correction=0).clamp_min(1e-8)
