@@ -23,9 +23,10 @@ class TransformedCharacterEnv(TransformedEnv):
         return {"base_env": self.base_env.state_dict(), "transform": self.transform.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
-        """Restore the state of :meth:`state_dict`."""
+        """Restore the state of :meth:`state_dict`; transforms keep nothing of episodes that do not go on."""
         self.base_env.load_state_dict(state_dict["base_env"])
-        self.transform.load_state_dict(state_dict["transform"])
+        if self.base_env.resumes_episodes:
+            self.transform.load_state_dict(state_dict["transform"])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if not kwargs.get("set_state"):
