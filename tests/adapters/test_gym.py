@@ -127,3 +127,14 @@ def test_pictures_are_refused_because_they_need_an_encoder():
 def test_an_environment_that_resets_itself_is_an_error_that_says_so():
     env = GymnasiumEnvs("SelfResetting-v0", 2, seed=0)
     refused(lambda: play(env, torch.zeros(4, 2, 1)), "SelfResetting-v0", "resets", error=ChildProcessError)
+
+
+def test_the_number_of_the_goal_is_a_whole_number_for_each_environment():
+    env = GymnasiumEnvs("Point-v0", 4, seed=0, goal_number="number")
+    require_specs(env)
+    assert env.num_goals == 7
+    state = env.reset()
+    places = (7 * (state["goal"].squeeze(-1) + 3.0) / 6.0).floor()  # seven places from -3 to 3
+    assert state["goal_number"].tolist() == places.tolist()
+    assert len(set(places.tolist())) > 1
+    refused(lambda: GymnasiumEnvs("Point-v0", 4, goal_number="desired_goal"), "goal_number", "desired_goal", "number")

@@ -11,6 +11,9 @@ LENGTH = 7
 """Steps of an episode of the points of Gymnasium."""
 
 
+PLACES = 7
+
+
 class Point(gymnasium.Env):
     """A point that moves by its action, in [-2, 2], towards a place on a line; Gymnasium's goal-conditioned form."""
 
@@ -20,12 +23,15 @@ class Point(gymnasium.Env):
         self.render_mode, self.reach = render_mode, reach
         box = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
         keys = ("observation", "achieved_goal", "desired_goal")
-        self.observation_space = gymnasium.spaces.Dict(dict.fromkeys(keys, box))
+        places = gymnasium.spaces.Discrete(PLACES)
+        self.observation_space = gymnasium.spaces.Dict({**dict.fromkeys(keys, box), "number": places})
         self.action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
 
     def _observed(self):
         x, goal = np.array([self.x]), np.array([self.goal])
-        return {"observation": np.array([self.steps], dtype=float), "achieved_goal": x, "desired_goal": goal}
+        number = int(PLACES * (self.goal + self.reach) / (2 * self.reach or 1))  # of seven places in a row
+        steps = np.array([self.steps], dtype=float)
+        return {"observation": steps, "achieved_goal": x, "desired_goal": goal, "number": number}
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -96,3 +102,10 @@ class Lasting(Points):
     def set_extra_state(self, state):
         self.x = state["x"].clone()
         self.generator.set_state(state["generator"])
+
+
+class Widening(Points):
+    """Points whose flags have two entries, unlike their specs say."""
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).set("far", torch.zeros(*self.batch_size, 2, dtype=torch.bool))

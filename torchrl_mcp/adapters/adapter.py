@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
-from torchrl_mcp.adapters.reading import Scaling, Vector
+from torchrl_mcp.adapters.reading import Number, Scaling, Vector
 
 GOALS = ("desired_goal", "goal")
 """Keys of the goal, of which the first that is observed is taken by default; Gymnasium's is ``desired_goal``."""
@@ -38,6 +38,8 @@ class Adapter(EnvBase):
         observation: Keys of the state of the policy, in order.
         goal: Keys of its goal, in order; none, ``()``, for environments without a goal. None takes ``desired_goal`` or
             ``goal`` if the environments observe one of them.
+        goal_number: Key of the number of each episode's goal, one-hot or an integer, which ``method=hierarchical``
+            needs in pre-training: it trains a primitive for each goal. None for environments without such a number.
         metrics: Keys of flags (bool) and numbers that are no inputs, such as ``success``.
         max_episode_steps: Steps after which an episode is ``truncated``, if it has not ended before. None takes the
             attribute of that name of ``env``.
@@ -73,6 +75,7 @@ class Adapter(EnvBase):
         *,
         observation: Sequence[NestedKey] = ("observation",),
         goal: Sequence[NestedKey] | None = None,
+        goal_number: NestedKey | None = None,
         metrics: Sequence[str] = (),
         max_episode_steps: int | None = None,
         worst: float = 0.0,
@@ -112,6 +115,8 @@ class Adapter(EnvBase):
         }
         self._metrics = {key: Vector("metrics", [key], spec) for key in metrics}
         self._flags = [key for key in metrics if spec[key].dtype is torch.bool]
+        self._number = None if goal_number is None else Number(goal_number, spec)
+        self.num_goals = self._number.count if self._number else 0
         self._scaling = Scaling(env, action_bounds)
         self._current: TensorDictBase | None = None  # observations and states of ``env`` for its next step
         self._elapsed = torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
@@ -210,6 +215,8 @@ class Adapter(EnvBase):
             observed[key] = (
                 Binary(shape=size, dtype=torch.bool, **place) if key in self._flags else Unbounded(size, **place)
             )
+        if self._number is not None:
+            observed["goal_number"] = Categorical(self.num_goals, shape=shape, dtype=torch.int64, **place)
         self.observation_spec = Composite(observed, shape=shape, **place)
         self.action_spec = Bounded(-1.0, 1.0, shape=self._scaling.shape, dtype=torch.float32, **place)
         self.reward_spec = Unbounded(one, **place)
@@ -254,6 +261,8 @@ class Adapter(EnvBase):
         emitted = {key: vector(observed) for key, vector in self._inputs.items()}
         for key, vector in self._metrics.items():
             emitted[key] = vector(observed).bool() if key in self._flags else vector(observed)
+        if self._number is not None:
+            emitted["goal_number"] = self._number(observed)
         emitted |= {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         return TensorDict(emitted, self.batch_size, device=self.device)
 

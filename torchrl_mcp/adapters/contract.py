@@ -40,7 +40,8 @@ class Environments(Protocol):
     | ``observation``, ``goal`` | state and goal, floating point | ``(N, S)``, ``(N, G)`` |
     | ``action`` | from -1 to 1 | ``(N, A)`` |
     | ``reward``, ``terminated``, ``truncated``, ``done`` | of the step | ``(N, 1)`` |
-    | ``task_reward`` | the task's own reward, if training uses another | ``(N, 1)`` |
+    | ``goal_number`` | optional: which of ``num_goals`` goals it is, for ``method=hierarchical`` | ``(N,)`` |
+    | ``task_reward`` | optional: the task's own reward, if training uses another | ``(N, 1)`` |
 
     The library's characters satisfy it, and :class:`~torchrl_mcp.adapters.adapter.Adapter` adds what other
     environments lack. :func:`~torchrl_mcp.adapters.check.require_contract` checks it.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 IMAGE = 3
@@ -70,6 +70,39 @@ class Vector:
 
 def _is_image(spec: TensorSpec) -> bool:
     return spec.ndim - 1 >= IMAGE or spec.dtype is torch.uint8
+
+
+class Number:
+    """The number of each environment's goal.
+
+    Args:
+        key: Its key, as one-hot or integer.
+        spec: What the environments observe, batch size ``[N]``.
+
+    Attributes:
+        count: Number of goals.
+
+    Raises:
+        ValueError: If it is missing, or is no choice among a fixed number.
+    """
+
+    def __init__(self, key: NestedKey, spec: Composite) -> None:
+        kind = spec[key] if key in spec.keys(True, True) else None
+        if not isinstance(kind, (OneHot, Categorical)):
+            raise ValueError(
+                f"goal_number names {key}, which is no observed choice among a fixed number, such as Gymnasium's "
+                f"Discrete: the environment observes {', '.join(map(str, spec.keys(True, True)))}"
+            )
+        self.key = key
+        self.count: int = kind.space.n
+        self._one_hot = isinstance(kind, OneHot)
+
+    def __call__(self, outcome: TensorDictBase) -> Tensor:
+        """Return the numbers in an output of the environments, from 0, ``(N,)``, int64."""
+        value = outcome[self.key]
+        if self._one_hot:
+            return value.to(torch.int64).argmax(-1)
+        return value.reshape(len(value)).to(torch.int64)
 
 
 class Scaling:

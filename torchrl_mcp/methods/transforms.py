@@ -84,11 +84,14 @@ class OptionMemory(Transform):
 class ClipAsOption(Transform):
     """A transform that adds the index of the reference motion as ``option``, so that each option imitates one clip.
 
+    Environments of other libraries have numbered goals in place of clips: ``goal_number``, ``(N,)``, one of
+    ``num_goals``.
+
     Args:
-        num_options: Number of options, and of the reference motions.
+        num_options: Number of options, and of the reference motions or goals.
 
     Raises:
-        ValueError: If it is attached to an environment with another number of reference motions.
+        ValueError: If it is attached to an environment with another number of them.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
@@ -100,16 +103,18 @@ class ClipAsOption(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``option``."""
-        library = getattr(self.parent, "library", ())
-        if len(library) != self.num_options:
+        skills = getattr(self.parent, "num_goals", 0) or len(getattr(self.parent, "library", ()))
+        if skills != self.num_options:
             raise ValueError(
                 f"num_options={self.num_options} primitives need as many reference motions, one each, and there are "
-                f"{len(library)}: pre-train with task=imitation and motions of that number, such as motions=turning"
+                f"{skills}: pre-train with task=imitation and motions of that number, such as motions=turning, or in "
+                "an environment with so many goals that observes the number of the goal (goal_number)"
             )
         return _with_integers(observation_spec, "option")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set("option", self.parent.episode["clip"].clone())
+        clip = next_tensordict.get("goal_number", None)
+        return next_tensordict.set("option", self.parent.episode["clip"].clone() if clip is None else clip.clone())
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
