@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.characters.mirror import Mirror
-from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.physics.engines import Engine, named
 from torchrl_mcp.envs.physics.simulation import LARGEST
 from torchrl_mcp.envs.rendering.camera import Arrow, Camera
@@ -117,6 +117,9 @@ class CharacterEnv(EnvBase):
 
     units: Mapping[str, str] = MappingProxyType({})
     """Units of the entries of ``observation`` and ``goal``, by name or by what follows its last dot."""
+
+    resumes_episodes = True
+    """See :class:`~torchrl_mcp.adapters.contract.Environments`."""
 
     batch_locked = True
     _supports_set_state = True
@@ -288,6 +291,10 @@ class CharacterEnv(EnvBase):
         if torch.device(device).type != self.device.type:
             raise ValueError(f"device={device}: the physics stays on {self.device}, so move the outputs instead")
         return self
+
+    def root_positions(self) -> Tensor:
+        """Horizontal position of each root, ``(N, 2)`` in metres, float64."""
+        return self.simulation.state["qpos"][:, :2].clone()
 
     def get_state(self) -> TensorDict:
         """Snapshot of the whole state except ``generator``, each entry ``(N, ...)``.

@@ -2,33 +2,14 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchrl_mcp.adapters.contract import Reach
+
 CLOSE = 0.01
 """Metres between a player and the object that it moves: at 0, the direction to the object is undefined."""
-
-
-class Reach(NamedTuple):
-    """Two returns with which those of a learner are compared.
-
-    Neither is a bound: who falls earns less than who stands, and an object that is moved to and fro at its target
-    earns a little more than one that rests there.
-
-    Args:
-        standing: Return of a player that stands still without falling, ``(N,)``.
-        ideal: Return of a player that goes where the task leads at its speed, and rests there, ``(N,)``.
-    """
-
-    standing: Tensor
-    ideal: Tensor
-
-    def place(self, returns: Tensor) -> Tensor:
-        """Mean position of returns between the two: 0 for standing still, 1 for the ideal, ``()``."""
-        standing = self.standing.mean()
-        return (returns.mean() - standing) / (self.ideal.mean() - standing)
 
 
 def transport_reach(

@@ -7,9 +7,9 @@ from typing import Any
 
 import mujoco
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_mcp.adapters.contract import TASK_REWARD
 from torchrl_mcp.envs.base import ALL, CharacterEnv
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
@@ -23,9 +23,6 @@ from torchrl_mcp.envs.observations import UNITS, character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
 from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
-
-TASK_REWARD = "task_reward"
-"""Key of the task's own reward in environments that train with another."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
@@ -285,12 +282,3 @@ class PDCharacterEnv(CharacterEnv):
         if self.curriculum.random_first_length and num == self.num_envs:
             start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
         return start
-
-
-def task_reward(outcome: TensorDictBase) -> Tensor:
-    """The task's own reward of steps, ``(*B, 1)``, even if training uses another reward.
-
-    Args:
-        outcome: Output of an environment's steps, batch size ``(*B,)``.
-    """
-    return outcome.get(TASK_REWARD, outcome["reward"])

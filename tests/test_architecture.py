@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
+    {"adapters"},
     {"distributions"},
     {"modules"},
     {"methods"},
@@ -24,6 +25,8 @@ ORDER = (
     {"cli"},
 )
 """Folders of ``torchrl_mcp``, of which each may import those before it."""
+CONTRACT = "torchrl_mcp.adapters.contract"
+"""Between environments and all that uses them."""
 RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folders}
 ROOMS = (
     {"arguments", "rotations"},
@@ -41,7 +44,7 @@ ROOMS = (
 ROOM_RANKS = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 HYDRA = {f"torchrl_mcp.runs.{name}" for name in ("configuration", "provenance", "build", "benchmark")}
 """Modules beside those of ``cli`` and ``commands`` that may import Hydra: composing, building, launching."""
-WITHOUT_HYDRA = {folder for folders in ORDER[:6] for folder in folders} | {"analysis", "viewer", "envs"}
+WITHOUT_HYDRA = {folder for folders in ORDER[:7] for folder in folders} | {"analysis", "viewer", "envs"}
 RESTORING = {"torchrl_mcp.analysis.checkpoints"}
 """Modules of theirs that restore runs, by way of ``runs.build``."""
 
@@ -91,8 +94,15 @@ def test_a_folder_imports_none_that_builds_on_it(name):
 def test_environments_know_nothing_of_what_learns():
     for module in MODULES:
         if folder(module) == "envs":
-            ours = {other for other in IMPORTS[module] if other.startswith("torchrl_mcp")}
+            ours = {other for other in IMPORTS[module] if other.startswith("torchrl_mcp")} - {CONTRACT}
             assert all(folder(other) == "envs" for other in ours), f"{module} imports {ours}"
+
+
+@pytest.mark.parametrize("name", ["adapters", "evaluation", "objectives", "training"])
+def test_what_learns_knows_nothing_of_the_library_own_environments(name):
+    for module in MODULES:
+        if folder(module) == name:
+            assert not [name for name in IMPORTS[module] if name.startswith("torchrl_mcp.envs")], module
 
 
 def room(name):

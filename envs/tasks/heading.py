@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.arguments import interval, not_negative, positive
 from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
-from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow

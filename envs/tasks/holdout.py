@@ -11,10 +11,10 @@ import mujoco
 import torch
 from torch import Tensor
 
+from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
-from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.rewards import holdout_reward

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
-from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow

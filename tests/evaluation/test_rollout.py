@@ -11,8 +11,8 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import IndependentNormal
 
+from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs import Holdout
-from torchrl_mcp.envs.ideal import Reach
 from torchrl_mcp.evaluation.rollout import Evaluation, episode_statistics, evaluate
 
 
@@ -93,7 +93,8 @@ def test_every_environment_gives_exactly_one_episode_however_short():
 
 
 def test_positions_are_recorded_until_an_episode_ends_and_are_nan_from_there():
-    positions = evaluate(IDLE, Countdown([2, 4])).positions
+    env = Countdown([2, 4])
+    positions = evaluate(IDLE, env, positions=lambda: env.get_state()["qpos"][:, :2]).positions
     assert positions.shape == (4, 2, 2)
     nan = math.nan
     short, long = [1.0, nan, nan, nan], [1.0, 2.0, 3.0, nan]
@@ -130,7 +131,7 @@ def test_returns_are_those_of_a_loop_by_hand():
 
 def test_the_deterministic_evaluation_repeats_to_the_bit_and_the_stochastic_one_does_not():
     policy = gaussian_policy()
-    first, second = (evaluate(policy, ants()) for _ in range(2))
+    first, second = (evaluate(policy, env, positions=env.root_positions) for env in (ants(), ants()))
     assert torch.equal(first.returns, second.returns)
     assert torch.equal(first.positions.nan_to_num(), second.positions.nan_to_num())
     first, second = (evaluate(policy, ants(), deterministic=False) for _ in range(2))
@@ -145,7 +146,6 @@ def episodes(returns, lengths=None, terminated=None):
         returns,
         torch.full(returns.shape, 10) if lengths is None else torch.tensor(lengths),
         torch.zeros(returns.shape, dtype=torch.bool) if terminated is None else torch.tensor(terminated),
-        torch.zeros(0, len(returns), 2),
     )
 
 

@@ -410,7 +410,7 @@ FAULTS = {
         ),
         (
             "means = {key: total / lengths.unsqueeze(-1)",
-            "means = {key: total / len(positions)",
+            "means = {key: total / len(decisions)",
             "evaluation/test_rollout.py",
         ),
         (

@@ -73,7 +73,8 @@ def explore(
     policy = TensorDictModule(
         lambda observation: explorer(normaliser(observation)), in_keys=["observation"], out_keys=["action"]
     )
-    outcome = evaluate(policy, env, start=start)
+    outcome = evaluate(policy, env, start=start, positions=env.root_positions)
+    assert outcome.positions is not None
     origin = start["qpos"][:, :2]
     positions = torch.cat([origin.unsqueeze(0), outcome.positions]) - origin
     return Exploration(positions.numpy(), outcome.terminated.numpy(), env.control_timestep)

@@ -52,7 +52,8 @@ def play_directions(
     env.reset()
     start = env.get_state()
     start["goal"] = unit_vector(directions).to(start["goal"].dtype)
-    outcome = evaluate(policy, env, deterministic=deterministic, start=start)
+    outcome = evaluate(policy, env, deterministic=deterministic, start=start, positions=env.root_positions)
+    assert outcome.positions is not None
     return Trajectories(directions.numpy().astype(np.float64), outcome.positions.numpy())
 
 

@@ -9,6 +9,7 @@ import torch
 from hydra.errors import HydraException
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
+from torchrl_mcp.adapters.adapter import Adapter
 from torchrl_mcp.commands.suggestions import answer
 from torchrl_mcp.commands.task_settings import task_settings
 from torchrl_mcp.envs import CharacterEnv
@@ -55,6 +56,8 @@ def show(
         "num_options": options,
         "aside": arguments.ghost_distance,
     }
+    if arguments.viewer is not None and isinstance(env, Adapter):
+        raise ValueError(f"{env.name} draws itself, in films alone: leave out --viewer {arguments.viewer}")
     match arguments.viewer:
         case None:
             size = {"width": arguments.width, "height": arguments.height}
@@ -72,14 +75,14 @@ def show(
             play_in_window(Player(policy, env, before_step=before_step, **look))
 
 
-def _restored(arguments: argparse.Namespace) -> tuple[Agent, CharacterEnv]:
+def _restored(arguments: argparse.Namespace) -> tuple[Agent, Any]:
     """Return the agent of a checkpoint, and an environment with some arguments of its task replaced."""
     settings = task_settings(arguments.task)
     _, agent, env = policies.restore(locate(arguments.checkpoint), num_envs=1, seed=arguments.seed, **settings)
     return agent, env
 
 
-def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, CharacterEnv]:
+def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Any]:
     """Return an untrained policy, and the environment of a configuration."""
     own = [f"hydra.searchpath=[{quoted(f'file://{arguments.config_dir.resolve()}')}]"] if arguments.config_dir else []
     try:

@@ -1,12 +1,13 @@
 """Evaluation of a policy on each of its reference motions."""
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
-from torchrl_mcp.envs import Imitation
 from torchrl_mcp.evaluation.rollout import evaluate
 
 
@@ -31,8 +32,39 @@ class ClipResult:
     length: float
 
 
+class FollowsClips(Protocol):
+    """Environments that follow reference motions, such as :class:`~torchrl_mcp.envs.Imitation`.
+
+    Attributes:
+        library: Clips, with ``names``, ``durations`` in seconds, and ``loops``.
+        switch_probability: Probability of a change of the reference in a step.
+        clip_end: What follows the end of a clip.
+    """
+
+    library: Any
+    switch_probability: float
+    clip_end: str
+    num_envs: int
+    max_episode_steps: int
+    control_timestep: float
+    batch_size: torch.Size
+    device: torch.device
+
+    def beginning(self, clips: Tensor, times: Tensor) -> dict[str, Tensor]:
+        """State at times in seconds of clips, ``(N,)`` each."""
+        ...
+
+    def get_state(self) -> TensorDict:
+        """State of the simulations."""
+        ...
+
+    def reset(self) -> TensorDictBase:
+        """Begin episodes."""
+        ...
+
+
 def follow_each(
-    policy: TensorDictModuleBase, env: Imitation, *, deterministic: bool = True, device: torch.device | str = "cpu"
+    policy: TensorDictModuleBase, env: FollowsClips, *, deterministic: bool = True, device: torch.device | str = "cpu"
 ) -> list[ClipResult]:
     """Follow every clip in the same number of episodes, which begin at times spread evenly over it.
 

@@ -1,5 +1,6 @@
 """Evaluation of a policy by one episode in each of many environments."""
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,8 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from torchrl_mcp.envs.ideal import Reach
-from torchrl_mcp.envs.pd_character import task_reward
+from torchrl_mcp.adapters.contract import Reach, task_reward
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.evaluation.statistics import mean
 
@@ -24,23 +24,23 @@ class Evaluation:
         returns: Undiscounted sum of the task's own rewards of each episode, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
-        positions: Horizontal position of the root after every step but an episode's last, ``(T, N, 2)`` in metres; from
-            there on NaN.
         metrics: Other measurements of the task by name, ``(N,)``: for a flag such as ``success``, whether it was ever
             raised in the episode; for a number such as ``tracking_error``, its mean over the steps.
         durations: Control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
         decisions: Recorded outputs of the policy, for all steps of all episodes, batch size ``(M,)``.
         reach: Returns of standing still and of an ideal player in the same episodes, if the task computes them.
+        positions: Positions after every step but an episode's last, ``(T, N, D)``, from there on NaN; None if they were
+            not measured.
     """
 
     returns: Tensor
     lengths: Tensor
     terminated: Tensor
-    positions: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
     durations: dict[str, Tensor] = field(default_factory=dict)
     decisions: TensorDictBase = field(default_factory=TensorDict)
     reach: Reach | None = None
+    positions: Tensor | None = None
 
 
 @torch.no_grad()
@@ -51,6 +51,8 @@ def evaluate(
     deterministic: bool = True,
     start: TensorDictBase | None = None,
     record: Collection[NestedKey] = (),
+    positions: Callable[[], Tensor] | None = None,
+    max_steps: float = math.inf,
     device: torch.device | str = "cpu",
 ) -> Evaluation:
     """Play one episode in each environment of a batch, to its end.
@@ -63,6 +65,8 @@ def evaluate(
         deterministic: Play the deterministic action rather than a sample.
         start: State to begin from, as returned by ``env.get_state()``, or None to draw it.
         record: Keys of the policy's output to keep as ``decisions``.
+        positions: Returns the positions of the environments, ``(N, D)``, which are then kept.
+        max_steps: Steps after which the episodes are left unfinished.
         device: Device of the policy.
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
@@ -72,7 +76,7 @@ def evaluate(
     returns = torch.zeros(env.batch_size, device=env.device)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64, device=env.device)
     terminated = torch.zeros_like(running)
-    positions: list[Tensor] = []
+    path: list[Tensor] = []
     decisions: list[TensorDictBase] = []
     flags: dict[str, Tensor] = {}
     sums: dict[str, Tensor] = {}
@@ -83,7 +87,7 @@ def evaluate(
     raised_steps = {key: torch.zeros_like(flag, dtype=torch.int64) for key, flag in flags.items()}
     steps = getattr(env, "max_episode_steps", None)
     with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
-        while running.any():
+        while running.any() and lengths.max() < max_steps:
             shown.update()
             decision = policy(state.select(*policy.in_keys).to(device))
             decisions.append(decision.select(*record)[running.to(device)])
@@ -98,13 +102,13 @@ def evaluate(
             for key, total in sums.items():
                 total += outcome[key] * running.unsqueeze(-1)
             running &= ~outcome["done"].squeeze(-1)
-            positions.append(torch.where(running.unsqueeze(-1), env.get_state()["qpos"][:, :2], torch.nan))
+            if positions is not None:
+                path.append(torch.where(running.unsqueeze(-1), positions(), torch.nan))
     means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
     metrics = _by_name(flags | means, names)
     durations = _by_name(raised_steps, names)
-    return Evaluation(
-        returns, lengths, terminated, torch.stack(positions), metrics, durations, torch.cat(decisions), reach
-    )
+    measured = torch.stack(path) if path else None
+    return Evaluation(returns, lengths, terminated, metrics, durations, torch.cat(decisions), reach, measured)
 
 
 def _by_name(values: dict[str, Tensor], names: dict[str, list[str]]) -> dict[str, Tensor]:

@@ -30,9 +30,10 @@ class TransformedCharacterEnv(TransformedEnv):
         return {"base_env": self.base_env.state_dict(), "transform": self.transform.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
-        """Restore the state of :meth:`state_dict`."""
+        """Restore the state of :meth:`state_dict`; transforms keep nothing of episodes that do not go on."""
         self.base_env.load_state_dict(state_dict["base_env"])
-        self.transform.load_state_dict(state_dict["transform"])
+        if self.base_env.resumes_episodes:
+            self.transform.load_state_dict(state_dict["transform"])
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if not kwargs.get("set_state"):
@@ -101,11 +102,14 @@ class OptionMemory(Transform):
 class ClipAsOption(Transform):
     """A transform that adds the index of the reference motion as ``option``, so that each option imitates one clip.
 
+    Environments of other libraries have numbered goals in place of clips: ``goal_number``, ``(N,)``, one of
+    ``num_goals``.
+
     Args:
-        num_options: Number of options, which is the number of reference motions.
+        num_options: Number of options, which is the number of reference motions or goals.
 
     Raises:
-        ValueError: If the environment has another number of reference motions.
+        ValueError: If the environment has another number of reference motions or goals.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
@@ -117,16 +121,18 @@ class ClipAsOption(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``option``."""
-        library = getattr(self.parent, "library", ())
-        if len(library) != self.num_options:
+        skills = getattr(self.parent, "num_goals", 0) or len(getattr(self.parent, "library", ()))
+        if skills != self.num_options:
             raise ValueError(
-                f"num_options={self.num_options} must be the number of reference motions, which is {len(library)}: "
-                "pre-train with task=imitation and as many motions, such as motions=turning"
+                f"num_options={self.num_options} must be the number of reference motions, which is {skills}: "
+                "pre-train with task=imitation and as many motions, such as motions=turning, or in an environment with "
+                "as many goals that observes the number of its goal (goal_number)"
             )
         return _with_integers(observation_spec, "option")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set("option", self.parent.episode["clip"].clone())
+        clip = next_tensordict.get("goal_number", None)
+        return next_tensordict.set("option", self.parent.episode["clip"].clone() if clip is None else clip.clone())
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

@@ -14,14 +14,21 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 from torchrl.envs import Compose
 
-from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.adapters.check import require_contract
+from torchrl_mcp.adapters.contract import Environments
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.publish import load_kept
-from torchrl_mcp.runs.requirements import require_arguments, require_entry, require_environment, require_files
+from torchrl_mcp.runs.requirements import (
+    applicable,
+    require_arguments,
+    require_entry,
+    require_environment,
+    require_files,
+)
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import begin_after
@@ -56,7 +63,7 @@ def make_source(cfg: DictConfig) -> TrajectorySource:
     return instantiate(cfg.collector)(factory, num_envs=cfg.training.num_envs, seed=cfg.seed)
 
 
-def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> CharacterEnv | TransformedCharacterEnv:
+def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Environments:
     """Return the environments of the configured task and stage, with the transforms that the method needs, if any.
 
     Raises:
@@ -64,16 +71,17 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Cha
     """
     require_environment(cfg)
     task, others = _with_parts(cfg.task[cfg.stage.name], kwargs)
-    require_arguments(task["_target_"], others)
+    arguments = applicable(task["_target_"], {"num_threads": cfg.num_threads, **others})
+    require_arguments(task["_target_"], arguments)
     require_files(cfg, task)
-    arguments = {"num_threads": cfg.num_threads, **others}
     env = instantiate(task)(num_envs=num_envs, seed=seed, **arguments)
+    require_contract(env)
     if not (transforms := instantiate(cfg.get("transforms", []))):
         return env
     return TransformedCharacterEnv(env, Compose(*transforms))
 
 
-def make_agent(cfg: DictConfig, env: CharacterEnv, pretrained: Path | None = None) -> Agent:
+def make_agent(cfg: DictConfig, env: Environments, pretrained: Path | None = None) -> Agent:
     """Return the agent of the configured method.
 
     If the checkpoint file ``pretrained`` is given, the parts that transfer keeps are loaded from it; in pre-training,
@@ -123,7 +131,7 @@ def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
         raise ValueError(f"{pretrained} has networks of {held}, which do not fit {wanted}: change either") from error
 
 
-def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: CharacterEnv, pretrained: Path) -> None:
+def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environments, pretrained: Path) -> None:
     """Load the parts that transfer keeps, which may have seen an entry of the goal alone."""
     origin = partial(builtin, cfg.method.name, cfg.character.name)
     if (name := cfg.transfer.goal_entry) is None:
@@ -165,7 +173,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
     return Trainer(source, agent, objective, settings, run_folder, progress_bar=cfg.progress_bar)
 
 
-def make_objective(cfg: DictConfig, agent: Agent, env: CharacterEnv | TransformedCharacterEnv) -> Objective:
+def make_objective(cfg: DictConfig, agent: Agent, env: Environments) -> Objective:
     """Return what the agent optimises, and its optimisers; of a frozen actor there is none."""
     actor_loss = instantiate(cfg.objective.loss)(agent.actor.trained)
     actor_loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)

@@ -4,8 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.adapters.check import require_specs
+from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import build, lock, places, records
 from torchrl_mcp.runs.configuration import Plan, initial_networks, planned
 from torchrl_mcp.runs.policies import evaluation
@@ -95,12 +98,27 @@ def _train(plan: Plan) -> Path:
     precision = choose(plan.cfg.autocast, plan.cfg.device)
     print(f"run folder: {plan.folder}{f', {precision}' if precision.autocast else ''}", flush=True)
     cfg = cast("DictConfig", OmegaConf.merge(plan.cfg, {"autocast": precision.autocast}))
-    if cfg.evaluation.episodes:  # refuses now what the evaluation would refuse after training
-        build.make_env(cfg, num_envs=1, seed=cfg.evaluation.seed, **cfg.evaluation.environment).close()
     trainer = build.make_run(cfg, plan.folder, plan.initial)
+    _rehearse(trainer, cfg)
     trainer.save()
     records.begin(plan.folder, trainer.folder.config, precision)
     return _finish(trainer, cfg, plan.folder)
+
+
+def _rehearse(trainer: Trainer, cfg: DictConfig) -> None:
+    """Take a step of the evaluation in environments of its own, which would otherwise fail after the training.
+
+    Raises:
+        ValueError: As :func:`~torchrl_mcp.adapters.check.require_specs`.
+    """
+    if not cfg.evaluation.episodes:
+        return
+    env = build.make_env(cfg, num_envs=1, seed=cfg.evaluation.seed, **cfg.evaluation.environment)
+    require_specs(env)
+    with torch.random.fork_rng(devices=[]):
+        outcome = evaluate(trainer.agent.actor.policy, env, max_steps=1, device=trainer.agent.device)
+    episode_statistics(outcome, env.normalised_return)
+    env.close()
 
 
 def _resume(folder: Path, device: str | None, total_frames: int | None, moves: Mapping[str, str]) -> Path:
@@ -128,6 +146,8 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
     if run_folder.frames(path):
         trainer = build.make_run(cfg, folder)
         trainer.restore(path)
+        if not trainer.source.resumes_episodes:
+            print("its episodes begin anew, because the state of the environments is not saved", flush=True)
     else:  # the environments had not been reset yet, so the checkpoint has no state of them
         trainer = build.make_run(cfg, folder, initial_networks(cfg))
         trainer.folder.metrics.rewind(0)

@@ -6,20 +6,26 @@ from typing import Any
 
 import torch
 
+from torchrl_mcp.adapters.adapter import Adapter
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 
 
-def interface(env: CharacterEnv) -> dict[str, str]:
+def interface(env: CharacterEnv | Adapter) -> dict[str, str]:
     """Return the interface of a policy to its environment, as JSON texts by key.
 
     ``observation`` and ``goal`` list their entries in order, with name, number of values and unit; ``action`` lists the
     actuators, whose control is ``centre + scale * action``, clipped to MuJoCo's ``ctrlrange``. ``scene`` is the MJCF of
     the environment, also as JSON.
 
+    Environments of other libraries have neither scene nor names: an entry is a whole input, and an action is that of
+    the environment.
+
     Args:
         env: The environment in which the policy was trained.
     """
+    if isinstance(env, Adapter):
+        return _adapted(env)
     described: dict[str, Any] = {
         "control_timestep": env.control_timestep,
         "physics_timestep": env.simulation.model.opt.timestep,
@@ -30,6 +36,21 @@ def interface(env: CharacterEnv) -> dict[str, str]:
     }
     if isinstance(env, PDCharacterEnv):
         described |= {"character": env.character.name, "feet": list(env.character.feet)}
+    return {key: json.dumps(value) for key, value in described.items()}
+
+
+def _adapted(env: Adapter) -> dict[str, str]:
+    """Return the interface of a policy to an environment of another library."""
+    sizes = {key: env.observation_spec[key].shape[-1] for key in ("observation", "goal")}
+    described: dict[str, Any] = {
+        "control_timestep": env.control_timestep,
+        **{key: [{"name": key, "size": size, "unit": ""}] for key, size in sizes.items()},
+        "action": [
+            {"name": f"action_{index}", "unit": "", "centre": centre, "scale": scale}
+            for index, (centre, scale) in enumerate(zip(*(part.tolist() for part in env.action_scaling()), strict=True))
+        ],
+        "environment": env.name,
+    }
     return {key: json.dumps(value) for key, value in described.items()}
 
 

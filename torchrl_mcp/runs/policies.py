@@ -8,11 +8,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-from torchrl_mcp.envs import CharacterEnv, Imitation
+from torchrl_mcp.envs import Imitation
 from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
-from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs import places, requirements
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
@@ -38,7 +37,7 @@ def policy_config(path: Path) -> DictConfig:
 
 def restore(
     path: Path | str, *, num_envs: int, seed: int, device: str = "cpu", **kwargs: Any
-) -> tuple[DictConfig, Agent, CharacterEnv | TransformedCharacterEnv]:
+) -> tuple[DictConfig, Agent, Any]:
     """Return configuration, trained agent and new environments from a run folder or checkpoint file.
 
     Args:
@@ -117,6 +116,7 @@ def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[s
         outcome = evaluate(agent.actor.policy, env, deterministic=mode == "deterministic", record=record)
         results[mode] = episode_statistics(outcome, env.normalised_return)
         results[mode]["diagnostics"] = diagnostics(agent.actor, outcome.decisions)
+        env.close()
     return results
 
 

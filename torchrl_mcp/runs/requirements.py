@@ -13,6 +13,7 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.adapters.contract import Environments
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import FOLDER
@@ -24,6 +25,10 @@ SHARED = {name: name for name in ("seed", "device", "physics", "num_threads")} |
 
 EVALUATED = SHARED | {"seed": "evaluation.seed", "num_envs": "evaluation.episodes"}
 """The same of environments that evaluate, which simulate on the CPU."""
+
+
+SIMULATION = frozenset({"device", "num_threads", "physics", "pin_memory"})
+"""Arguments that settings of the run give to simulations, and that environments of other libraries do not take."""
 
 
 def require_all(cfg: DictConfig) -> None:
@@ -142,6 +147,8 @@ def require_equipment(cfg: DictConfig) -> None:
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
             "build of torch on a machine with a GPU"
         )
+    if cfg.physics.on_device and "physics" not in arguments(cfg.task[cfg.stage.name]["_target_"]):
+        raise ValueError(f"physics=warp cannot simulate task={cfg.task.name}, whose physics is its own: pass mujoco")
     if cfg.physics.on_device and "num_workers" in cfg.collector:
         raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
     kind = cfg.logger.logger_type if cfg.logger else "csv"
@@ -193,7 +200,7 @@ def require_arguments(name: str, given: Collection[str]) -> None:
         raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
 
 
-def require_entry(env: CharacterEnv, name: str) -> slice:
+def require_entry(env: Environments, name: str) -> slice:
     """Return the place of an entry in an environment's goal.
 
     Raises:
@@ -204,6 +211,19 @@ def require_entry(env: CharacterEnv, name: str) -> slice:
         known = f"has {', '.join(layout)}" if len(layout) > 1 else "is one entry: leave it out"
         raise ValueError(f"transfer.goal_entry={name} is not an entry of the task's goal, which {known}")
     return layout[name]
+
+
+def applicable(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments given to environments without those of a simulation that they do not take.
+
+    Args:
+        name: Name of the class or function that makes the environments.
+        given: Their arguments.
+    """
+    taken = arguments(name)
+    if any(map(_is_open, taken.values())):
+        return dict(given)
+    return {key: value for key, value in given.items() if key in taken or key not in SIMULATION}
 
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:

@@ -15,14 +15,11 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
-from torchrl_mcp.envs import CharacterEnv
-from torchrl_mcp.methods.transforms import TransformedCharacterEnv
+from torchrl_mcp.adapters.contract import Environments
 from torchrl_mcp.training import ray_workers
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
-
-Environments = CharacterEnv | TransformedCharacterEnv
 
 PATIENCE = 5.0
 """Seconds after which workers that have not ended are killed."""
@@ -86,17 +83,17 @@ class TrajectorySource(Protocol):
 class LocalSource:
     """A trajectory source of environments in this process.
 
-    Its state includes the environments' state, so that a resumed run continues their episodes to the same numbers.
+    Its state is the environments' state. If that includes their episodes, a resumed run continues these to the same
+    numbers.
 
     Args:
         env: Environments, batch size ``[N]``, with or without transforms.
     """
 
-    resumes_episodes = True
-
     def __init__(self, env: Environments) -> None:
         self.env = env
-        self.num_envs: int = env.batch_size[0]
+        self.num_envs = env.batch_size[0]
+        self.resumes_episodes = env.resumes_episodes
 
     def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
         """Set up TorchRL's collector."""

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mcp.envs.pd_character import task_reward
+from torchrl_mcp.adapters.contract import task_reward
 
 
 class EpisodeStatistics:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
@@ -49,6 +49,9 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
+    if not player.simulated:
+        yield from own_pictures(player, seconds=seconds, width=width, height=height, every=every)
+        return
     timestep, model = player.env.control_timestep, softly_lit(player.env.simulation.model)
     camera, distance = Camera(model, width=width, height=height), DISTANCE * player.extent
     camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
@@ -65,12 +68,26 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
             camera.view.lookat = centre if player.began else followed(camera.view.lookat, centre, timestep / lag)
             data.light_xpos[fixed, :2] += centre[:2]
             if step % every == every - 1:
-                picture = Image.fromarray(camera.picture(data, distance=distance, shapes=player.shapes).numpy())
-                if player.weights is not None:
-                    draw_bars(picture, player.weights.values, player.weights.title)
-                yield picture
+                picture = camera.picture(data, distance=distance, shapes=player.shapes)
+                yield _with_weights(Image.fromarray(picture.numpy()), player)
     finally:
         camera.close()
+
+
+def own_pictures(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
+    """Play, and let an environment of another library draw itself, as :func:`film`."""
+    for step in range(round(seconds / player.env.control_timestep)):
+        player.step()
+        if step % every == every - 1:
+            picture = Image.fromarray(player.env.render().numpy())
+            yield _with_weights(ImageOps.pad(picture, (width, height)), player)
+
+
+def _with_weights(picture: Image.Image, player: Player) -> Image.Image:
+    """Draw the weights of the primitives on a picture, if there are any."""
+    if player.weights is not None:
+        draw_bars(picture, player.weights.values, player.weights.title)
+    return picture
 
 
 def followed(place: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:

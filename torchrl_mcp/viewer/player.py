@@ -40,6 +40,7 @@ class Player:
 
     Attributes:
         env: The environments without transforms.
+        simulated: Whether the environments are simulations of MuJoCo; others draw themselves.
         extent: Largest distance of the character from its centre of mass, in metres.
         began: Whether an episode has just begun.
         state: Current observations of the environment.
@@ -57,7 +58,8 @@ class Player:
         before_step: Callable[[], object] | None = None,
     ) -> None:
         self.env: CharacterEnv = env.base_env if isinstance(env, TransformedCharacterEnv) else env
-        self.extent = extent(self.env.simulation.model)
+        self.simulated = hasattr(self.env, "simulation")
+        self.extent = extent(self.env.simulation.model) if self.simulated else 1.0
         self.pinned: dict[int, float] = {}
         self._policy, self._transformed, self._num_options = policy, env, num_options
         self._exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM

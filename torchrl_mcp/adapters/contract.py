@@ -1,0 +1,125 @@
+"""The contract between environments and all that uses them: TorchRL's ``EnvBase``, and a few members more."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+
+TASK_REWARD = "task_reward"
+"""Key of the task's own reward in environments that train with another."""
+
+
+class Reach(NamedTuple):
+    """Two returns with which those of a learner are compared.
+
+    Neither is a bound: who falls earns less than who stands, and an object that is moved to and fro at its target
+    earns a little more than one that rests there.
+
+    Args:
+        standing: Return of a player that stands still without falling, ``(N,)``.
+        ideal: Return of a player that goes where the task leads at its speed, and rests there, ``(N,)``.
+    """
+
+    standing: Tensor
+    ideal: Tensor
+
+    def place(self, returns: Tensor) -> Tensor:
+        """Mean position of returns between the two: 0 for standing still, 1 for the ideal, ``()``."""
+        standing = self.standing.mean()
+        return (returns.mean() - standing) / (self.ideal.mean() - standing)
+
+
+class Environments(Protocol):
+    """N environments side by side, a TorchRL ``EnvBase`` with batch size ``[N]``.
+
+    | key | content | shape |
+    |---|---|---|
+    | ``observation``, ``goal`` | state and goal, floating point | ``(N, S)``, ``(N, G)`` |
+    | ``action`` | from -1 to 1 | ``(N, A)`` |
+    | ``reward``, ``terminated``, ``truncated``, ``done`` | of the step | ``(N, 1)`` |
+    | ``goal_number`` | optional: which of ``num_goals`` goals it is, for ``method=hierarchical`` | ``(N,)`` |
+    | ``task_reward`` | optional: the task's own reward, if training uses another | ``(N, 1)`` |
+
+    The library's characters satisfy it, and :class:`~torchrl_mcp.adapters.adapter.Adapter` adds what other
+    environments lack. :func:`~torchrl_mcp.adapters.check.require_contract` checks it.
+
+    Attributes:
+        max_episode_steps: Most steps of an episode, which then ends as ``truncated``.
+        control_timestep: Seconds from one action to the next.
+        metric_names: Observations that are metrics and not inputs of the policy, ``(N, E)`` by key: flags (bool) or
+            numbers, with the names of their entries.
+        num_diverged: Number of episodes so far that ended because their simulation diverged.
+        goal_layout: Slices of ``goal`` by name, in order; empty if they have no names.
+        resumes_episodes: Whether ``state_dict`` holds the state of all episodes, so that a resumed run continues them
+            to the same numbers; otherwise it begins new episodes.
+    """
+
+    max_episode_steps: int
+    control_timestep: float
+    num_diverged: int
+    goal_layout: Mapping[str, slice]
+    resumes_episodes: bool
+
+    @property
+    def metric_names(self) -> dict[str, list[str]]:
+        """See the class."""
+        ...
+
+    @property
+    def physics_seconds(self) -> float:
+        """Wall-clock seconds so far of the simulation, without what surrounds it."""
+        ...
+
+    def normalised_return(self, episode_return: Tensor) -> Tensor:
+        """Undiscounted returns on the scale of reports, where 0 is bad and 1 is good, of the same shape."""
+        ...
+
+    def reach(self) -> Reach | None:
+        """Returns of standing still and of an ideal player in the episodes just begun, None if unknown."""
+        ...
+
+    def mirrors(self) -> Mapping[str, nn.Module]:
+        """Reflections that exchange left and right in ``observation``, ``goal`` and ``action``.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        ...
+
+    # Of EnvBase: the rest of what is called
+    batch_size: torch.Size
+    device: torch.device
+    observation_spec: Composite
+    action_spec: TensorSpec
+
+    def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Begin episodes."""
+        ...
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step, and begin new episodes after ended ones."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """State for :meth:`load_state_dict`, without pickled code."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> object:
+        """Restore the state."""
+        ...
+
+    def close(self) -> object:
+        """Free what the environments use."""
+        ...
+
+
+def task_reward(outcome: TensorDictBase) -> Tensor:
+    """The task's own reward of steps, also if training uses another, ``(*B, 1)``.
+
+    Args:
+        outcome: Output of an environment's steps, batch size ``(*B,)``.
+    """
+    return outcome.get(TASK_REWARD, outcome["reward"])
