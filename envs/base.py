@@ -362,8 +362,8 @@ class CharacterEnv(EnvBase):
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
         seen = self._observed_of(ALL)
         name = f"{type(self).__name__}.observe()"
-        if lost := [key for key in ("observation", "goal") if key not in seen]:
-            raise ValueError(f"{name} lacks {lost[0]}: return it, with shape ({self.num_envs}, 0) if it is empty")
+        if missing := [key for key in ("observation", "goal") if key not in seen]:
+            raise ValueError(f"{name} lacks {missing[0]}: return it, with shape ({self.num_envs}, 0) if it is empty")
         if wrong := [key for key, value in seen.items() if value.ndim != 2 or len(value) != self.num_envs]:
             raise ValueError(
                 f"{wrong[0]} of {name} has shape {tuple(seen[wrong[0]].shape)}: return ({self.num_envs}, numbers)"

@@ -217,8 +217,8 @@ class PDCharacterEnv(CharacterEnv):
             orientation, linear and angular velocity in the character's heading frame, ``(n, M, 13)``.
         """
         seen = character_state(self.heading(ids).to(self._dtype), self._body_states(ids))
-        own = 1 + 13 * len(self._bodies)
-        return seen[:, :own], seen[:, own:].unflatten(-1, (-1, 13))
+        size = 1 + 13 * len(self._bodies)
+        return seen[:, :size], seen[:, size:].unflatten(-1, (-1, 13))
 
     def training_reward(self) -> Tensor:
         """Reward of the last step with the curriculum's ``reward_weights``, ``(N,)``, float64.

@@ -44,8 +44,8 @@ class Character:
         Args:
             self_collision: Let its bodies collide with one another, except bodies that a joint connects.
         """
-        own = nullcontext(self.file) if self.file else as_file(files(__package__) / f"{self.name}.xml")
-        with own as path:
+        opened = nullcontext(self.file) if self.file else as_file(files(__package__) / f"{self.name}.xml")
+        with opened as path:
             spec = mujoco.MjSpec.from_file(str(path))
         for geom in spec.geoms:
             if self_collision and geom.conaffinity:

@@ -73,7 +73,7 @@ def violations(
     """
     model = spec.compile()
     named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
-    found = [
+    faults = [
         *_scenery(model),
         *_defaults(spec),
         *_root(model),
@@ -86,10 +86,10 @@ def violations(
         *_facing(model, sides),
         *_timestep(model),
     ]
-    if not found and (failure := collapse(spec, tuple(feet))):
+    if not faults and (failure := collapse(spec, tuple(feet))):
         remedy = "give it larger torques and gains, another pose, or feet on which it can stand"
         return [Violation(f"does not hold its rest pose: {failure}", remedy)]
-    return found
+    return faults
 
 
 def lowest_points(model: mujoco.MjModel) -> dict[str, float]:
@@ -176,8 +176,10 @@ def kinds_of(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _scenery(model: mujoco.MjModel) -> Iterator[Violation]:
-    if own := [model.geom(geom).name or "unnamed" for geom in np.flatnonzero(model.geom_bodyid == 0)]:
-        yield Violation(f"has a floor or other scenery of its own ({', '.join(own)})", "remove it, tasks bring theirs")
+    if fixed := [model.geom(geom).name or "unnamed" for geom in np.flatnonzero(model.geom_bodyid == 0)]:
+        yield Violation(
+            f"has a floor or other scenery of its own ({', '.join(fixed)})", "remove it, tasks bring theirs"
+        )
     if model.nlight:
         yield Violation(f"has {model.nlight} light(s) of its own", "remove them, tasks bring theirs")
 
@@ -253,8 +255,8 @@ def _actuators(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
     servo = model.actuator_biasprm[:, 1] == -model.actuator_gainprm[:, 0]
     servo &= (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     if torques := [model.actuator(index).name for index in np.flatnonzero(~servo)]:
-        found = f"{len(torques)} actuators are not position servos ({', '.join(torques)})"
-        yield Violation(found, "make them <position>: targets would be taken for torques")
+        finding = f"{len(torques)} actuators are not position servos ({', '.join(torques)})"
+        yield Violation(finding, "make them <position>: targets would be taken for torques")
     if free := [model.actuator(index).name for index in np.flatnonzero(model.actuator_ctrllimited == 0)]:
         yield Violation(
             f"actuators have no ctrlrange ({', '.join(free)})", "give them one, to which actions are scaled"
@@ -271,11 +273,11 @@ def _controls(model: mujoco.MjModel, body: int) -> list[str]:
 
 
 def _shapes(model: mujoco.MjModel) -> Iterator[Violation]:
-    own = colliding(model)
-    other = {mujoco.mjtGeom(model.geom_type[geom]).name for geom in own} - {shape.name for shape in SHAPES}
+    geoms = colliding(model)
+    other = {mujoco.mjtGeom(model.geom_type[geom]).name for geom in geoms} - {shape.name for shape in SHAPES}
     if other:
         yield Violation(f"collides with shapes of kind {', '.join(sorted(other))}", "use spheres, capsules and boxes")
-    if any((model.geom_contype[geom], model.geom_conaffinity[geom]) != (0, 1) for geom in own):
+    if any((model.geom_contype[geom], model.geom_conaffinity[geom]) != (0, 1) for geom in geoms):
         yield Violation("its shapes collide with one another", 'give them contype="0" conaffinity="1"')
 
 
@@ -324,10 +326,10 @@ def _facing(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
     mujoco.mj_kinematics(model, data)
     places = {model.body(body).name: float(data.xipos[body, 1]) for body in range(1, model.nbody)}
     for right, left in sides:
-        own = [name for name in places if name.startswith(right) or name.endswith(right)]
-        if sum(places[name] - places.get(twin(name, sides), places[name]) for name in own) > APART:
+        on_right = [name for name in places if name.startswith(right) or name.endswith(right)]
+        if sum(places[name] - places.get(twin(name, sides), places[name]) for name in on_right) > APART:
             remedy = f"turn the root, with x forward and y to the left, or exchange the sides ({left}:{right})"
-            yield Violation(f"{', '.join(own)} of the right side are on the left", remedy)
+            yield Violation(f"{', '.join(on_right)} of the right side are on the left", remedy)
 
 
 def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:

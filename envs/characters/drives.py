@@ -181,11 +181,11 @@ def load(model: mujoco.MjModel, body: int, feet: Sequence[int]) -> Load:
     least = LEAST * gravity * total * float(data.xpos[1, 2])
     anchor, beyond, rest = data.xanchor[joints_of(model, body)[0]], data.subtree_com[body], max(total - mass, 1e-9)
     behind = (total * data.subtree_com[1] - mass * beyond) / rest
-    own = [foot for foot in feet if body in line_of(model, foot)]
-    if not own or len(own) == len(feet):
+    below = [foot for foot in feet if body in line_of(model, foot)]
+    if not below or len(below) == len(feet):
         centre, weight = (beyond, mass) if mass < rest else (behind, rest)
         return Load(max(HOLDING * gravity * weight * float(np.linalg.norm(centre - anchor)), least), 0.0)
-    lever = max(_reach(model, data, foot, anchor) for foot in own)
+    lever = max(_reach(model, data, foot, anchor) for foot in below)
     weight = gravity * rest
     topples = weight * max(float(behind[2] - anchor[2]), 0.0) / len(feet)
     return Load(max(weight / max(len(feet) // 2, 1) * lever, least), STEADY * topples)
@@ -209,14 +209,14 @@ def drive(model: mujoco.MjModel, body: int, needed: Load, torque: float | None, 
     joints = joints_of(model, body)
     dofs = [dof for joint in joints for dof in np.flatnonzero(model.dof_jntid == joint)]
     motors = [motor(model, joint) for joint in joints]
-    own = Motor(*np.max(motors, axis=0).tolist())
-    limit, limit_from = _chosen(torque, own.torque, needed.torque)
+    strongest = Motor(*np.max(motors, axis=0).tolist())
+    limit, limit_from = _chosen(torque, strongest.torque, needed.torque)
     torques = [one.torque for one in motors]
     limits = _about_axes(model.jnt_axis[joints], torques) if limit_from == FILE and all(torques) else [limit] * 3
-    kp, kp_from = _chosen(gain, own.gain, max(limit / LIMIT_ANGLE, needed.gain))
+    kp, kp_from = _chosen(gain, strongest.gain, max(limit / LIMIT_ANGLE, needed.gain))
     passive = float(model.dof_damping[dofs].max())
-    damping = own.damping if kp_from == FILE and (own.damping or passive) else 0.075 * kp
-    passive = passive or (0.0 if own.damping and kp_from == FILE else 0.025 * kp)
+    damping = strongest.damping if kp_from == FILE and (strongest.damping or passive) else 0.075 * kp
+    passive = passive or (0.0 if strongest.damping and kp_from == FILE else 0.025 * kp)
     armature = float(model.dof_armature[dofs].max())
     steady = max(TIMESTEP * (damping / 2 - passive), TIMESTEP**2 * kp / 4, armature)
     return Drive(

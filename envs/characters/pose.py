@@ -80,11 +80,11 @@ def _hinges(model: mujoco.MjModel, pattern: str, word: str) -> list[int]:
     hinges = np.flatnonzero(model.jnt_type == HINGE).tolist()
     names = {hinge: model.joint(hinge).name for hinge in hinges}
     try:
-        found = [hinge for hinge in hinges if re.search(pattern, names[hinge])]
+        matches = [hinge for hinge in hinges if re.search(pattern, names[hinge])]
     except re.error as error:
         raise ValueError(f"--pose {word}: {pattern} is not a regular expression: {error}") from error
-    if found:
-        return found
+    if matches:
+        return matches
     raise ValueError(f"--pose {word} matches no hinge: they are {', '.join(names.values())}")
 
 

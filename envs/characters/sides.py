@@ -52,9 +52,9 @@ def twin(name: str, sides: Sides = SIDES) -> str:
 def guessed_sides(names: Iterable[str]) -> Sides:
     """Return the usual pairs by which names come in twos, for :func:`twin`, without those that add none."""
     names = set(names)
-    found: Sides = ()
+    pairs: Sides = ()
     for pair in USUAL:
-        paired = {name for name in names if twin(name, found) == name != twin(name, (pair,))}
+        paired = {name for name in names if twin(name, pairs) == name != twin(name, (pair,))}
         if paired and {twin(name, (pair,)) for name in paired} == paired:
-            found += (pair,)
-    return found
+            pairs += (pair,)
+    return pairs

@@ -48,9 +48,9 @@ def support(character: str, states: BodyStates) -> Support:
     """Return the lowest contact point of all bodies that can collide, and the slowest near it, in T frames."""
     names = sorted(colliding_bodies(character_model(character)))
     points = [contact_points(character, name, states) for name in names]
-    owners = [index for index, found in enumerate(points) for _ in found.offsets]
-    heights = torch.cat([found.positions[..., 2] for found in points], dim=1)
-    speeds = torch.cat([found.velocities.norm(dim=-1) for found in points], dim=1)
+    owners = [index for index, point in enumerate(points) for _ in point.offsets]
+    heights = torch.cat([point.positions[..., 2] for point in points], dim=1)
+    speeds = torch.cat([point.velocities.norm(dim=-1) for point in points], dim=1)
     height, lowest = heights.min(-1, keepdim=True)
     slowest = speeds.where(heights <= height + LAYER, torch.inf).amin(-1)
     return Support(height.squeeze(-1), slowest, [names[owners[index]] for index in lowest.squeeze(-1).tolist()])

@@ -9,5 +9,5 @@ def smoothed(values: Tensor, fps: float, window: float) -> Tensor:
     """Average over time, the last dimension, with a Hann window of ``window`` seconds; the ends are held."""
     half = max(1, min(round(window * fps / 2), values.shape[-1] - 1))
     weights = torch.hann_window(2 * half + 1, periodic=False, dtype=values.dtype)
-    held = pad(values.reshape(-1, 1, values.shape[-1]), (half, half), mode="replicate")
-    return conv1d(held, (weights / weights.sum()).view(1, 1, -1)).view_as(values)
+    padded = pad(values.reshape(-1, 1, values.shape[-1]), (half, half), mode="replicate")
+    return conv1d(padded, (weights / weights.sum()).view(1, 1, -1)).view_as(values)

@@ -61,9 +61,9 @@ def soles(clip: MotionClip, *, sinking: float = STILL) -> Soles:
     states = body_states(clip.character, clip.qpos, clip.qvel)
     feet = CHARACTERS[clip.character].feet
     points = [contact_points(clip.character, foot, states) for foot in feet]
-    heights = torch.stack([found.positions[..., 2].amin(-1) for found in points], dim=-1)
-    velocities = torch.stack([found.velocities.mean(1) for found in points], dim=1)
-    single = torch.tensor([len(found.offsets) == 1 for found in points])
+    heights = torch.stack([point.positions[..., 2].amin(-1) for point in points], dim=-1)
+    velocities = torch.stack([point.velocities.mean(1) for point in points], dim=1)
+    single = torch.tensor([len(point.offsets) == 1 for point in points])
     tilts = _tilts(clip, states.orientations).masked_fill(single, 0.0)
     still = (velocities[..., :2].norm(dim=-1) < STILL) & (velocities[..., 2].abs() < sinking)
     low = heights < support(clip.character, states).heights.unsqueeze(-1) + LOW

@@ -200,17 +200,17 @@ def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
     The tip is a sphere that rolls without sliding: it advances by its radius times the angle.
     """
     start = 0.0 if side == "right" else 0.5
-    own = phase - start
-    count, own = own.floor(), own % 1
-    progress = minimum_jerk((own - SWING[0]) / (SWING[1] - SWING[0]))
+    elapsed = phase - start
+    count, elapsed = elapsed.floor(), elapsed % 1
+    progress = minimum_jerk((elapsed - SWING[0]) / (SWING[1] - SWING[0]))
     ground = _plant(side, start + count + progress, speed, turn_rate)
-    pitch, lift, aside = (halting(keyframes, own) for keyframes in (FOOT_PITCH, FOOT_LIFT, FOOT_ASIDE))
+    pitch, lift, aside = (halting(keyframes, elapsed) for keyframes in (FOOT_PITCH, FOOT_LIFT, FOOT_ASIDE))
     pitch = pitch * (1 + _walking(speed)) / 2
     orientation = ground.quaternions(about_y(-pitch))
     tip, radius = _tip(side)
     moved = torch.stack([-radius * pitch, aside if side == "left" else -aside, radius + lift], dim=-1)
     position = ground.points(moved) - rotate(orientation, tip.expand(len(phase), 3))
-    return Step(position, orientation, ground.turn, own)
+    return Step(position, orientation, ground.turn, elapsed)
 
 
 def _plant(side: str, touchdown: Tensor, speed: float, turn_rate: float) -> Placement:

@@ -54,13 +54,13 @@ def new_context(width: int, height: int) -> GLContext:
 def _platform() -> Callable[[int, int], GLContext] | None:
     """Return the class of contexts that works: the one in ``MUJOCO_GL`` if set, else the first of ``PLATFORMS``."""
     asked = os.environ.get("MUJOCO_GL", "")
-    found = next(filter(_works, PLATFORMS if sys.platform == "linux" and not asked else (asked,)), None)
-    if found not in PLATFORMS:
-        return None if found is None else mujoco.GLContext
+    platform = next(filter(_works, PLATFORMS if sys.platform == "linux" and not asked else (asked,)), None)
+    if platform not in PLATFORMS:
+        return None if platform is None else mujoco.GLContext
     # MuJoCo chose its own class on import, but looks up OpenGL's functions when it first draws.
-    os.environ["MUJOCO_GL"] = found
+    os.environ["MUJOCO_GL"] = platform
     os.environ.pop(PYOPENGL, None)  # MuJoCo refuses another value than its own
-    return import_module(f"mujoco.{found}").GLContext
+    return import_module(f"mujoco.{platform}").GLContext
 
 
 def _works(platform: str) -> bool:

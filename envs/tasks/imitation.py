@@ -316,8 +316,8 @@ class Imitation(PDCharacterEnv):
                 linear, angular = (qvel - reference.qvel)[:, :6].square().split(3, -1)
                 return linear.sum(-1) + 0.1 * angular.sum(-1)
             case "key_positions":
-                own, other = (at[:, self._keys] - at[:, :1] for at in (positions, targets))
-                return squared_distances(own, other).mean(-1)
+                positions_at, other = (at[:, self._keys] - at[:, :1] for at in (positions, targets))
+                return squared_distances(positions_at, other).mean(-1)
             case "bodies":
                 return squared_distances(positions, targets).mean(-1)
             case "orientations":

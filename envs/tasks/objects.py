@@ -90,12 +90,16 @@ def horizontal_extent(model: mujoco.MjModel, num_bodies: int, poses: Tensor, low
     """
     data = mujoco.MjData(model)
     radius = 0.0
-    own = np.flatnonzero((model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0))
+    of_character = np.flatnonzero(
+        (model.geom_bodyid > 0) & (model.geom_bodyid <= num_bodies) & (model.geom_conaffinity > 0)
+    )
     for pose in poses.cpu().numpy():
         data.qpos[: len(pose)] = pose
         mujoco.mj_kinematics(model, data)
-        half_sizes = np.einsum("gij,gj->gi", np.abs(data.geom_xmat[own].reshape(-1, 3, 3)), model.geom_aabb[own, 3:])
-        centres = data.geom_xpos[own] - data.xpos[1] * [1, 1, 0]
+        half_sizes = np.einsum(
+            "gij,gj->gi", np.abs(data.geom_xmat[of_character].reshape(-1, 3, 3)), model.geom_aabb[of_character, 3:]
+        )
+        centres = data.geom_xpos[of_character] - data.xpos[1] * [1, 1, 0]
         between = (centres[:, 2] - half_sizes[:, 2] < high) & (centres[:, 2] + half_sizes[:, 2] > low)
         corners = (np.abs(centres) + half_sizes)[between, :2]
         radius = max(radius, float(np.hypot(*corners.T).max(initial=0.0)))

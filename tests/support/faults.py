@@ -193,7 +193,7 @@ FAULTS = {
         ("shares < self.in_motion", "shares > self.in_motion", "envs/test_initial_states.py"),
         ("if library.character != character", "if False", "envs/test_initial_states.py"),
     ],
-    "envs/ideal.py": [("(returns.mean() - standing)", "returns.mean()", "evaluation/test_rollout.py")],
+    "torchrl_mcp/adapters/contract.py": [("(returns.mean() - standing)", "returns.mean()", "evaluation/test_rollout.py")],
     "envs/characters/mirror.py": [
         (
             "BODY_SIGNS = (1, -1, 1, 1, -1, 1, -1,",
@@ -484,8 +484,8 @@ FAULTS = {
     ],
     "torchrl_mcp/runs/records.py": [
         (
-            "if changed := differences(held, wanted, SAME_RUN",
-            "if changed := differences(held, held, SAME_RUN",
+            "if changed := differences(saved, wanted, SAME_RUN",
+            "if changed := differences(saved, saved, SAME_RUN",
             "runs/test_faults.py::test_a_run_whose_files_do_not_fit_is_not_resumed",
         ),
         (
@@ -529,25 +529,25 @@ FAULTS = {
         ('if kind_of_device == "mps"', "if False", "runs/test_remedies.py"),
         ('if kind != "csv" and find_spec(kind) is None', "if False", "runs/test_remedies.py"),
         (
-            "if cfg.physics.on_device and",
-            "if False and",
+            'if cfg.physics.on_device and "num_workers"',
+            'if False and "num_workers"',
             "runs/test_physics.py::test_an_engine_that_cannot_simulate_is_refused",
         ),
         (
-            "if own := [name for name in given if",
-            "if own := [name for name in given if False and",
+            "if unread := [name for name in given if",
+            "if unread := [name for name in given if False and",
             "runs/test_remedies.py",
         ),
         ("and cfg.transfer.keep and cfg.pretrained is None", "and False", "runs/test_remedies.py"),
         (
-            "    if not lost:\n        return\n",
+            "    if not missing:\n        return\n",
             "    return\n",
             "runs/test_places.py::test_motions_are_found_from_every_folder_and_missed_by_the_name_of_their_setting",
         ),
         ("    require_trusted(config, source)\n", "", "runs/test_trust.py"),
     ],
     "torchrl_mcp/runs/trust.py": [
-        ('if any("${" in text for text in _texts(config))', "if False", "runs/test_trust.py"),
+        ('if any("${" in f"{name}{value}" for name, value in leaves(config))', "if False", "runs/test_trust.py"),
         ("if path.stat().st_size > LARGEST", "if False", "runs/test_trust.py"),
         ("if _depth(text) > DEEPEST", "if False", "runs/test_trust.py"),
         ('if "*" in text and', "if False and", "runs/test_trust.py"),

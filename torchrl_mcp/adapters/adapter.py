@@ -108,10 +108,10 @@ class Adapter(EnvBase):
         self._range = worst, solved
         self._draw = render
         spec = env.observation_spec
-        found = [key for key in GOALS if key in spec.keys(True)][:1]
+        observed_goals = [key for key in GOALS if key in spec.keys(True)][:1]
         self._inputs = {
             "observation": Vector("observation", observation, spec),
-            "goal": Vector("goal", found if goal is None else goal, spec),
+            "goal": Vector("goal", observed_goals if goal is None else goal, spec),
         }
         self._metrics = {key: Vector("metrics", [key], spec) for key in metrics}
         self._flags = [key for key in metrics if spec[key].dtype is torch.bool]

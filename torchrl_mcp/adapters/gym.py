@@ -107,8 +107,10 @@ class Informing(gymnasium.Wrapper):
             ValueError: If the environment resets itself.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if own := [name for name in FINAL if name in info]:
-            raise ValueError(f"the environment resets itself (info has {own[0]}): take off the wrapper that resets it")
+        if finals := [name for name in FINAL if name in info]:
+            raise ValueError(
+                f"the environment resets itself (info has {finals[0]}): take off the wrapper that resets it"
+            )
         return observation, reward, terminated, truncated, self._named(info)
 
     def _named(self, info: Mapping[str, Any]) -> dict[str, Any]:
@@ -134,7 +136,7 @@ def _kinds(env: gymnasium.Env, names: Sequence[str], id: str) -> dict[str, torch
     env.reset(seed=0)
     env.action_space.seed(0)
     *_, info = env.step(env.action_space.sample())
-    if lost := [name for name in names if name not in info or np.ndim(info[name])]:
+    if missing := [name for name in names if name not in info or np.ndim(info[name])]:
         numbers = ", ".join(name for name, value in info.items() if not np.ndim(value)) or "nothing"
-        raise ValueError(f"info=[{lost[0]}] is no number of id={id}: after a step, its info has {numbers}")
+        raise ValueError(f"info=[{missing[0]}] is no number of id={id}: after a step, its info has {numbers}")
     return {name: torch.as_tensor(np.asarray(info[name])).dtype for name in names}

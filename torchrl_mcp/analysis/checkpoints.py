@@ -73,8 +73,8 @@ def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk
             fresh = build.make_agent(cfg, env)
         for name in ("observation_normaliser", "goal_normaliser"):
             fresh.parts[name].load_state_dict(agent.parts[name].state_dict())
-        said = fresh.actor.policy(walk.inputs.clone())
-        gates, actions = (said[key].double().numpy() for key in ("gates", PRIMITIVES[0]))
+        outputs = fresh.actor.policy(walk.inputs.clone())
+        gates, actions = (outputs[key].double().numpy() for key in ("gates", PRIMITIVES[0]))
         numbers.append(specialisation(dataclasses.replace(walk, gates=gates, actions=actions)))
     return {key: statistics.mean(row[key] for row in numbers) for key in numbers[0]}
 

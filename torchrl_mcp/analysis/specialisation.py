@@ -129,9 +129,9 @@ def silhouettes(actions: Array) -> Array:
     distances = np.sqrt((squares[:, None] + squares - 2 * points @ points.T).clip(min=0.0))
     np.fill_diagonal(distances, 0.0)
     sums = distances.reshape(num_primitives, num_states, num_primitives, num_states).sum(-1)
-    own = np.arange(num_primitives)
-    within = sums[own, :, own] / (num_states - 1)
-    sums[own, :, own] = np.inf
+    indices = np.arange(num_primitives)
+    within = sums[indices, :, indices] / (num_states - 1)
+    sums[indices, :, indices] = np.inf
     nearest = sums.min(-1) / num_states
     return _ratio(nearest - within, np.maximum(within, nearest)).mean(-1)
 

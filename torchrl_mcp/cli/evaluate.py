@@ -53,8 +53,8 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
         if reach := numbers.get("reach"):
             share, standing, ideal = round(100 * reach["place"]), reach["standing"], reach["ideal"]
             print(f"    {share}% of the way from standing still ({standing:.3f}) to an ideal player ({ideal:.3f})")
-        if found := numbers["diagnostics"]:
-            print(text_table([{"diagnostic": name, "value": value} for name, value in found.items()]))
+        if diagnostics := numbers["diagnostics"]:
+            print(text_table([{"diagnostic": name, "value": value} for name, value in diagnostics.items()]))
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
             print("the options have collapsed: one of them acts almost always")
     if clips:

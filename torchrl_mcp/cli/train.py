@@ -59,8 +59,8 @@ examples:
 def main() -> None:
     """Run the command line; if Hydra cannot compose it, say what to write instead."""
     trusted, words = take_trust(sys.argv[1:])
-    if own := {"--help", "-h", "--version"} & set(words):
-        parser().parse_args(sorted(own))
+    if answered := {"--help", "-h", "--version"} & set(words):
+        parser().parse_args(sorted(answered))
     from hydra.errors import HydraException
 
     from torchrl_mcp.commands.suggestions import answer

@@ -53,12 +53,12 @@ def check(arguments: argparse.Namespace) -> int:
     model = spec.compile()
     sides = _sides(model, arguments.sides)
     feet = arguments.feet or guessed_feet(model, sides)
-    found = violations(spec, feet=feet, sides=sides)
-    _print(found)
-    print(_verdict(arguments.file, found, feet))
+    faults = violations(spec, feet=feet, sides=sides)
+    _print(faults)
+    print(_verdict(arguments.file, faults, feet))
     if passive := passive_bodies(model):
         print(f"passive, because they have no actuator: {', '.join(passive)}")
-    return bool(found)
+    return bool(faults)
 
 
 def adapt(arguments: argparse.Namespace) -> int:
@@ -98,22 +98,22 @@ def adapt(arguments: argparse.Namespace) -> int:
         }
     )
     print(*_description(body, source, arguments), sep="\n")
-    found = violations(written, feet=body.feet, key_bodies=ends, sides=body.sides)
-    _print(found)
+    faults = violations(written, feet=body.feet, key_bodies=ends, sides=body.sides)
+    _print(faults)
     print(f"{name}: {model.nv} degrees of freedom, {model.nu} controls, {model.body_mass.sum():.3g} kg. Next:")
     if folder != Path():
         print(f"  cd {shlex.quote(str(folder))}")
     print(f"  torchrl-mcp-play --agent zero --config-dir own task=heading character={name}")
     print(f"  torchrl-mcp-train --config-dir own task=heading character={name} method=scratch")
-    return bool(found)
+    return bool(faults)
 
 
 def _require_unused(name: str, folder: Path) -> None:
     """Check that a new name is of no character and no module, which would be imported instead."""
     known = {"ant", *(name for name, character in CHARACTERS.items() if character.file is None)}
-    found = find_spec(name)
-    if not (folder / f"{name}.xml").exists() and (name in known or (found and found.origin)):
-        owner = "a character of the library" if name in known else f"a Python module, {found and found.origin}"
+    module = find_spec(name)
+    if not (folder / f"{name}.xml").exists() and (name in known or (module and module.origin)):
+        owner = "a character of the library" if name in known else f"a Python module, {module and module.origin}"
         raise ValueError(f"{name} is the name of {owner}: choose another (--name)")
 
 

@@ -157,10 +157,10 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
     for path in arguments.files:
         try:
             archived = path.suffix.lower() == ".npz" and _is_clip(path)
-            own = str(Archive(path).array("character")) if archived else HUMANS[0]
+            character = str(Archive(path).array("character")) if archived else HUMANS[0]
             motion = imported(
                 path,
-                arguments.character or own,
+                arguments.character or character,
                 rate=arguments.rate,
                 fps=arguments.fps,
                 scale=arguments.scale,

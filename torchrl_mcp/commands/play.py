@@ -84,11 +84,13 @@ def _restored(arguments: argparse.Namespace) -> tuple[Agent, Any]:
 
 def _agent(arguments: argparse.Namespace) -> tuple[TensorDictModuleBase, Any]:
     """Return an untrained policy, and the environment of a configuration."""
-    own = [f"hydra.searchpath=[{quoted(f'file://{arguments.config_dir.resolve()}')}]"] if arguments.config_dir else []
+    searchpath = (
+        [f"hydra.searchpath=[{quoted(f'file://{arguments.config_dir.resolve()}')}]"] if arguments.config_dir else []
+    )
     try:
-        cfg = configuration.compose_run(*own, *arguments.settings)
+        cfg = configuration.compose_run(*searchpath, *arguments.settings)
         if cfg.stage.name not in cfg.task:
-            cfg = configuration.compose_run(*own, *arguments.settings, "stage=transfer")
+            cfg = configuration.compose_run(*searchpath, *arguments.settings, "stage=transfer")
     except HydraException as error:
         raise ValueError(answer(error, arguments.settings)) from error
     env = build.make_env(cfg, num_envs=1, seed=arguments.seed, **task_settings(arguments.task))

@@ -17,15 +17,15 @@ def task_settings(words: list[str]) -> dict[str, Any]:
     Raises:
         ValueError: If a word cannot be read, has no value or a wrong one, or names what the command gives itself.
     """
-    if lost := [word for word in words if "=" not in word]:
-        raise ValueError(f"--task {lost[0]} has no value: write --task {lost[0]}=VALUE")
+    if valueless := [word for word in words if "=" not in word]:
+        raise ValueError(f"--task {valueless[0]} has no value: write --task {valueless[0]}=VALUE")
     try:
         given = OmegaConf.from_dotlist(words)
     except (OmegaConfBaseException, LookupError) as error:
         raise ValueError(f"--task {' '.join(words)} cannot be read: {' '.join(str(error).split())}") from error
     settings = cast("dict[str, Any]", OmegaConf.to_container(given))
-    if own := [name for name in OWN if name in settings]:
-        raise ValueError(f"--task {own[0]} would not be read: what the command can change of it is in --help")
+    if unread := [name for name in OWN if name in settings]:
+        raise ValueError(f"--task {unread[0]} would not be read: what the command can change of it is in --help")
     if wrong := list(wrong_values(settings)):
         raise ValueError("\n".join(f"--task {line}" for line in wrong))
     return settings

@@ -83,8 +83,8 @@ def _explained(cfg: DictConfig) -> Iterator[None]:
 def _place(error: HydraException) -> str:
     """Return the last line of code, outside of installed packages, of the error that Hydra tells of."""
     frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ else []
-    own = [frame for frame in frames if "site-packages" not in frame.filename]
-    return f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+    outside = [frame for frame in frames if "site-packages" not in frame.filename]
+    return f" ({outside[-1].filename}, line {outside[-1].lineno})" if outside else ""
 
 
 @contextmanager

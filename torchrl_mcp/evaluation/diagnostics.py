@@ -29,12 +29,12 @@ def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
         Numbers of :func:`~torchrl_mcp.modules.gate_diagnostics` under ``gates/``, if there are gates, and of
         :func:`~torchrl_mcp.methods.options.option_diagnostics` under ``options/``, if options are chosen.
     """
-    found = {}
+    groups = {}
     if "gates" in actor.stored:
-        found["gates"] = gate_diagnostics(samples["gates"])
+        groups["gates"] = gate_diagnostics(samples["gates"])
     if actor.num_options and "begins" in actor.stored:
-        found["options"] = option_diagnostics(samples["option"], samples["begins"], actor.num_options)
-    named = {f"{group}/{name}": value for group, values in found.items() for name, value in values.items()}
+        groups["options"] = option_diagnostics(samples["option"], samples["begins"], actor.num_options)
+    named = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
     if not named:
         return {}
     return dict(zip(named, torch.stack(list(named.values())).tolist(), strict=True))  # one transfer from a GPU

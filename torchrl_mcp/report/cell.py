@@ -173,8 +173,8 @@ class Cell:
                 f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, which training would not do"
                 for protocol, runs in grouped(others, _protocol).items()
             ),
-            *(f"mixed {found}" for found in mixed("evaluations", protocols(self.complete))),
-            *(f"mixed {found}" for found in mixed("pre-trainings", map(_pretraining, self.runs))),
+            *(f"mixed {difference}" for difference in mixed("evaluations", protocols(self.complete))),
+            *(f"mixed {difference}" for difference in mixed("pre-trainings", map(_pretraining, self.runs))),
             *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),
         ]
 
@@ -212,8 +212,8 @@ def protocols(runs: Sequence[Run]) -> list[str]:
 
 def mixed(name: str, values: Iterable[str]) -> list[str]:
     """Return a line with the values, if they are more than one."""
-    found = sorted(set(values))
-    return [f"{name}: {', '.join(found)}"] if len(found) > 1 else []
+    distinct = sorted(set(values))
+    return [f"{name}: {', '.join(distinct)}"] if len(distinct) > 1 else []
 
 
 def _protocol(run: Run) -> str:
@@ -223,8 +223,8 @@ def _protocol(run: Run) -> str:
 
 def _changed(run: Run) -> dict[str, Any]:
     """Return the settings of the task in a run's evaluation that its configuration has otherwise."""
-    held = leaves(run.evaluation.get("environment") or {}, "evaluation.environment.")
-    changed = {name: value for name, value in held if run.settings.get(name, value) != value}
+    evaluated = leaves(run.evaluation.get("environment") or {}, "evaluation.environment.")
+    changed = {name: value for name, value in evaluated if run.settings.get(name, value) != value}
     return {name.removeprefix("evaluation.environment."): value for name, value in changed.items()}
 
 
@@ -232,8 +232,8 @@ def _is_evaluated_otherwise(run: Run) -> bool:
     """Return whether a run's evaluation has other episodes, or another task, than its configuration says."""
     names = ("episodes", "seed")
     planned = [run.settings.get(f"evaluation.{name}") for name in names]
-    held = [run.evaluation.get(name) for name in names]
-    return bool(_changed(run)) or (bool(planned[0]) and None not in (*planned, *held) and planned != held)
+    played = [run.evaluation.get(name) for name in names]
+    return bool(_changed(run)) or (bool(planned[0]) and None not in (*planned, *played) and planned != played)
 
 
 def _pretraining(run: Run) -> str:

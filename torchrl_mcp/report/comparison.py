@@ -53,12 +53,12 @@ def cells(runs: Iterable[Run]) -> list[Cell]:
     Runs of one task, character, stage, method and title share a cell unless their :func:`choices` differ, or any other
     setting that :mod:`~torchrl_mcp.runs.identity` counts. Runs of different commits may share a cell.
     """
-    found = []
+    groups = []
     for alike in grouped(runs, lambda run: (run.place, run.stage, run.method, run.title)).values():
         telling = varying([choices(run) for run in alike])
         for chosen in grouped(alike, lambda run: _frozen(choices(run))).values():
-            found += _cells(chosen, telling)
-    return sorted(found, key=_order)
+            groups += _cells(chosen, telling)
+    return sorted(groups, key=_order)
 
 
 def reported(run: Run) -> Reported | None:
@@ -107,14 +107,14 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
 def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
     """Cells of runs with the same choices; ``telling`` are the names of choices that differ from other runs."""
     others = _independent(varying([_learned(run) for run in runs]), runs)
-    found = []
+    groups = []
     for alike in grouped(runs, lambda run: _frozen(_learned(run), others)).values():
         first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
         settings = {name: named[name] for name in telling if named[name] is not None}
         settings |= {name: learned.get(name, DEFAULT) for name in others}
         by_seed = sorted(alike, key=lambda run: run.seed)
-        found.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
-    return found
+        groups.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
+    return groups
 
 
 def _independent(names: Sequence[str], runs: Sequence[Run]) -> list[str]:

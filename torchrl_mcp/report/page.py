@@ -57,25 +57,25 @@ def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime)
 
 def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
     """Return the variables of the templates."""
-    found = cells(runs)
-    stages = {stage: [cell for cell in found if cell.stage == stage] for stage in ("transfer", "pretrain")}
+    groups = cells(runs)
+    stages = {stage: [cell for cell in groups if cell.stage == stage] for stage in ("transfer", "pretrain")}
     names = (f"plot-{number}" for number in count(1))
     machines = list(dict.fromkeys(map(_machine, runs)))
-    shared, aggregate = over_rows(found)
-    palette = method_colours(found)
+    shared, aggregate = over_rows(groups)
+    palette = method_colours(groups)
     context = {
-        "runs": [run for cell in found for run in cell.runs],
+        "runs": [run for cell in groups for run in cell.runs],
         "states": states(runs, damaged),
         "damaged": [*damaged, *(Damaged(run.path, run.fault) for run in runs if run.fault)],
         "overview": _overview([row(cell) for cell in stages["transfer"] if cell.is_standard]),
-        "picture": _picture(found),
-        "has_reported": any(cell.reported for cell in found),
-        "titles": methods(found),
+        "picture": _picture(groups),
+        "has_reported": any(cell.reported for cell in groups),
+        "titles": methods(groups),
         "shared": shared,
         "aggregate": aggregate if min(len(shared), len(aggregate)) > 1 else {},
         "transfer": task_sections(stages["transfer"], names, palette),
-        "ablations": ablation_chapters(found, names),
-        "diagnostics": diagnostic_tables(found),
+        "ablations": ablation_chapters(groups, names),
+        "diagnostics": diagnostic_tables(groups),
         "pretraining": task_sections(stages["pretrain"], names, palette),
         "machines": machines,
     }

@@ -219,7 +219,7 @@ def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
                 "row": row(cell),
                 "numbers": numbers,
                 "usage": [(run.seed, usage(run, group)) for run in cell.complete],
-                "verdicts": [(run.seed, said) for run in cell.complete if (said := verdict(run, group))],
+                "verdicts": [(run.seed, sentence) for run in cell.complete if (sentence := verdict(run, group))],
             }
             for cell in cells
             if (numbers := diagnostics(cell, group))

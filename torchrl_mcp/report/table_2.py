@@ -59,10 +59,10 @@ def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
     Returns:
         The figure, or None if no row has been run.
     """
-    rows = {place: found for place in PLACES if (found := compared(cells, place))}
+    rows = {place: row for place in PLACES if (row := compared(cells, place))}
     if not rows:
         return None
-    run = methods(cell for found in rows.values() for cell in found.values())
+    run = methods(cell for row in rows.values() for cell in row.values())
     named = TITLES | {name: title for name, title in run.items() if name not in TITLES}
     lines, columns = -(-len(rows) // COLUMNS), min(len(rows), COLUMNS)
     figure = new_figure(1.2 + 2.2 * columns, 0.5 + (0.5 + 0.27 * len(named)) * lines)
@@ -101,9 +101,9 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
 
 def over_rows(cells: Sequence[Cell]) -> tuple[list[Place], dict[str, Estimate]]:
     """Return the rows of Table 2 in which every method was run, and each method's interquartile mean over them."""
-    rows = {place: found for place in PLACES if (found := compared(cells, place))}
-    named = methods(cell for found in rows.values() for cell in found.values())
-    shared = [place for place, found in rows.items() if found.keys() == named.keys()]
+    rows = {place: row for place in PLACES if (row := compared(cells, place))}
+    named = methods(cell for row in rows.values() for cell in row.values())
+    shared = [place for place, row in rows.items() if row.keys() == named.keys()]
     returns = {name: [rows[place][name].returns() for place in shared] for name in named if shared}
     return shared, {name: interquartile_mean(strata) for name, strata in returns.items()}
 
@@ -120,10 +120,10 @@ def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
     Returns:
         The figure, or None if MCP and another method share no row.
     """
-    rows = [found for place in PLACES if "mcp" in (found := compared(cells, place)) and len(found) > 1]
+    rows = [row for place in PLACES if "mcp" in (row := compared(cells, place)) and len(row) > 1]
     if not rows:
         return None
-    named = methods(cell for found in rows for cell in found.values())
+    named = methods(cell for row in rows for cell in row.values())
     others = [method for method in named if method != "mcp"]
     shared, means = over_rows(cells)
     ahead = {

@@ -24,22 +24,24 @@ def diagnostics(cell: Cell, group: str) -> dict[str, float]:
 
 def usage(run: Run, group: str) -> list[float]:
     """Usage of each primitive: the mean weight for ``gates``, the share of steps for ``options``."""
-    found = _diagnostics(run, group)
-    return [found[f"usage_{index}"] for index in range(sum(name.startswith("usage_") for name in found))]
+    values = _diagnostics(run, group)
+    return [values[f"usage_{index}"] for index in range(sum(name.startswith("usage_") for name in values))]
 
 
 def verdict(run: Run, group: str) -> str | None:
     """Return a problem of the ``gates`` or ``options`` of a run, or None."""
-    found = _diagnostics(run, group)
-    if min(found.get("effective_primitives", math.inf), found.get("effective_options", math.inf)) < COLLAPSED:
+    values = _diagnostics(run, group)
+    if min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf)) < COLLAPSED:
         return f"one {PARTS[group]} does almost all the work"
-    if found.get("sum", 0.0) > WIDE_OPEN * len(usage(run, group)):
+    if values.get("sum", 0.0) > WIDE_OPEN * len(usage(run, group)):
         return "the gates are almost fully open, so they hardly select"
-    if found.get("begin_rate", 0.0) > RESTLESS:
+    if values.get("begin_rate", 0.0) > RESTLESS:
         return "a new option begins at almost every step"
     return None
 
 
 def _diagnostics(run: Run, group: str) -> dict[str, float]:
-    found = run.evaluation["deterministic"].get("diagnostics", {})
-    return {name.removeprefix(f"{group}/"): value for name, value in found.items() if name.startswith(f"{group}/")}
+    diagnostics = run.evaluation["deterministic"].get("diagnostics", {})
+    return {
+        name.removeprefix(f"{group}/"): value for name, value in diagnostics.items() if name.startswith(f"{group}/")
+    }

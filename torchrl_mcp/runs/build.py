@@ -123,12 +123,16 @@ def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
         saved = OmegaConf.create(dict(checkpoint.saved_config(pretrained)))
         numbers = [name for name, number in cfg.method.standard.items() if isinstance(number, int)]
         names = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
-        theirs, ours = ({name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg))
-        if theirs == ours:
+        saved_values, values = (
+            {name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg)
+        )
+        if saved_values == values:
             raise
-        other = [name for name in names if theirs[name] != ours[name]]
-        held, wanted = (" ".join(f"{name}={one[name]}" for name in other) for one in (theirs, ours))
-        raise ValueError(f"{pretrained} has networks of {held}, which do not fit {wanted}: change either") from error
+        other = [name for name in names if saved_values[name] != values[name]]
+        saved_words, words = (" ".join(f"{name}={one[name]}" for name in other) for one in (saved_values, values))
+        raise ValueError(
+            f"{pretrained} has networks of {saved_words}, which do not fit {words}: change either"
+        ) from error
 
 
 def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environments, pretrained: Path) -> None:

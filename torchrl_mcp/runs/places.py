@@ -95,8 +95,8 @@ def digests(config: Mapping[str, Any]) -> dict[str, str]:
     from torchrl_mcp.envs.characters import CHARACTERS  # imports MuJoCo, which no --help needs
 
     character = CHARACTERS.get(config["character"]["name"])
-    own = {"character": digest(character.file)} if character and character.file else {}
-    return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()} | own
+    model = {"character": digest(character.file)} if character and character.file else {}
+    return {name: digest(Path(value)) for name, value in outside(config).items() if Path(value).exists()} | model
 
 
 def digest(path: Path) -> str:

@@ -63,10 +63,10 @@ def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
     Raises:
         ValueError: If the folder holds no run, or one of another version of the library.
     """
-    held = places.stored(run_config(folder))
+    stored = places.stored(run_config(folder))
     inputs = _origin(folder).get("inputs", {})
     other = [name for name, mark in places.digests(config).items() if inputs.get(name, mark) != mark]
-    return list(dict.fromkeys([*differences(held, config), *other]))
+    return list(dict.fromkeys([*differences(stored, config), *other]))
 
 
 def require_free(folder: Path, config: Mapping[str, Any]) -> None:
@@ -83,9 +83,9 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
         if not run_folder.find_all(folder):
             raise ValueError(f"{folder} holds a run without checkpoints: give another run_dir, or remove the folder")
         changed = changes(folder, config)
-        held = f"a run that differs in {', '.join(changed)}: " if changed else ""
+        other = f"a run that differs in {', '.join(changed)}: " if changed else ""
         remedy = "" if changed else f"this run already: continue it with {resuming(folder)}, or "
-        raise ValueError(f"{folder} holds {held or remedy}give another run_dir")
+        raise ValueError(f"{folder} holds {other or remedy}give another run_dir")
     if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
         raise ValueError(
             f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: put that back to continue the "
@@ -133,23 +133,23 @@ def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) 
     Raises:
         ValueError: If the folder holds no run, or another length is no number of steps or less than the run has taken.
     """
-    held = _held(folder)
-    planned = held["training"]["total_frames"]
+    config = _held(folder)
+    planned = config["training"]["total_frames"]
     total = planned if total_frames is None else total_frames
     if wrong := list(wrong_values({"training": {"total_frames": total}})):
         raise ValueError(wrong[0])
     if total != planned and total < (taken := run_folder.frames(checkpoint.find(folder))):
         raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
-    known = places.outside(held)
+    known = places.outside(config)
     new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
-    return {**places.moved(held, new), "training": {**held["training"], "total_frames": total}}
+    return {**places.moved(config, new), "training": {**config["training"], "total_frames": total}}
 
 
 def store(folder: Path, config: Mapping[str, Any]) -> None:
     """Store a configuration of a run as :func:`replanned`, and its provenance."""
-    held = _held(folder)
-    planned, total = (one["training"]["total_frames"] for one in (held, config))
-    if config != held:
+    stored = _held(folder)
+    planned, total = (one["training"]["total_frames"] for one in (stored, config))
+    if config != stored:
         _write_config(config, folder)
     if total != planned:
         frames = run_folder.frames(checkpoint.find(folder))
@@ -162,11 +162,11 @@ def require_same_run(cfg: DictConfig, path: Path) -> None:
     Raises:
         ValueError: If it belongs to another run.
     """
-    held, wanted = (
+    saved, wanted = (
         {**config, "training": {**config["training"], "total_frames": None}}
         for config in (checkpoint.saved_config(path), places.stored(cfg))
     )
-    if changed := differences(held, wanted, SAME_RUN | {"pretrained", "evaluation", "budget"}):
+    if changed := differences(saved, wanted, SAME_RUN | {"pretrained", "evaluation", "budget"}):
         raise ValueError(
             f"{path} is not of this run: it differs from {CONFIG} in {', '.join(changed)}. Put this run's own "
             "checkpoint back, or remove the file to go on from the one before"
@@ -190,9 +190,10 @@ def _held(folder: Path) -> dict[str, Any]:
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     config = read_config(folder / CONFIG)
-    if lost := [name for name in ("task", "stage", "training") if name not in config]:
+    if missing := [name for name in ("task", "stage", "training") if name not in config]:
         raise ValueError(
-            f"{folder / CONFIG} is damaged, without {', '.join(lost)}: put it back from a copy, or give another run_dir"
+            f"{folder / CONFIG} is damaged, because it lacks {', '.join(missing)}: put it back from a copy, or give "
+            "another run_dir"
         )
     return config
 

@@ -42,8 +42,8 @@ def require_all(cfg: DictConfig) -> None:
     require_files(cfg, cfg.task[cfg.stage.name])
     require_equipment(cfg)
     for section, given in ((cfg.stage.name, SHARED), ("evaluation", EVALUATED)):
-        if own := [name for name in given if name in (cfg.task.get(section) or ())]:
-            raise ValueError(f"task.{section}.{own[0]} would not be read: give {given[own[0]]} instead")
+        if unread := [name for name in given if name in (cfg.task.get(section) or ())]:
+            raise ValueError(f"task.{section}.{unread[0]} would not be read: give {given[unread[0]]} instead")
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
         ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
         raise ValueError(
@@ -117,12 +117,12 @@ def require_files(cfg: DictConfig, task: DictConfig) -> None:
         ValueError: If one is missing, with the settings that give a new place.
     """
     files = places.settings(OmegaConf.to_container(task, resolve=True))
-    lost = {value: name for name, value in files if not Path(value).exists()}
-    if not lost:
+    missing = {value: name for name, value in files if not Path(value).exists()}
+    if not missing:
         return
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     named = {value: name for name, value in places.outside(config).items()}
-    value, argument = next(iter(lost.items()))
+    value, argument = next(iter(missing.items()))
     name = named.get(value, f"task.{cfg.stage.name}.{argument}")
     raise ValueError(
         f"{name}={value} does not exist: put it back, or give its new place by {name}=PATH, with resume= by "
@@ -168,15 +168,15 @@ def require_known(config: Mapping[str, Any], source: Path) -> None:
     """
     names = list(targets(config))
     # Importing the library's own modules runs no other code, so it is safe before the check of trust.
-    if lost := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
+    if missing := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
         raise ValueError(
-            f"{source} is of another version of torchrl-mcp: this version has no {lost[0]}. "
+            f"{source} is of another version of torchrl-mcp: this version has no {missing[0]}. "
             "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
         )
     require_trusted(config, source)
-    if lost := [name for name in names if not _exists(name)]:
+    if missing := [name for name in names if not _exists(name)]:
         raise ValueError(
-            f"{source} names {lost[0]}, which Python does not find: if the module is yours, run the command in its "
+            f"{source} names {missing[0]}, which Python does not find: if the module is yours, run the command in its "
             "folder, or add its folder to PYTHONPATH"
         )
 
@@ -233,13 +233,13 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
     """
     made = pkgutil.resolve_name(name)
     kinds = made.__mro__ if inspect.isclass(made) else ()
-    found: dict[str, inspect.Parameter] = {}
+    parameters_by_name: dict[str, inspect.Parameter] = {}
     for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
         parameters = inspect.signature(maker).parameters
-        found = {**parameters, **found}
+        parameters_by_name = {**parameters, **parameters_by_name}
         if not any(map(_is_open, parameters.values())):
-            return {name: parameter for name, parameter in found.items() if not _is_open(parameter)}
-    return found
+            return {name: parameter for name, parameter in parameters_by_name.items() if not _is_open(parameter)}
+    return parameters_by_name
 
 
 def _is_open(parameter: inspect.Parameter) -> bool:

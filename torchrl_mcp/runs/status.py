@@ -105,13 +105,13 @@ def look(folder: Path, runs: Runs | None = None) -> list[Status]:
     damaged: list[Status] = []
     if runs is None:
         configs = sorted(path for path in folder.rglob(CONFIG) if is_run(os.listdir(path.parent)))
-        found: dict[Path, int | None] = {path.parent.resolve(): None for path in configs}
+        totals: dict[Path, int | None] = {path.parent.resolve(): None for path in configs}
         for path in sorted(folder.rglob(MANIFEST.format("*"))):
             try:
-                found |= read_manifest(path)
+                totals |= read_manifest(path)
             except UNREADABLE:
                 damaged.append(Status(path, "damaged", 0, 0))
-        runs = found
+        runs = totals
     return [_status(run, total) for run, total in runs.items()] + damaged
 
 

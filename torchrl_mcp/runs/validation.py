@@ -235,8 +235,8 @@ def require_used(cfg: DictConfig) -> None:
     groups = {group: config[group] for group in COMPARED if isinstance(config[group], Mapping)}
     names = [*config, *(f"{group}.{key}" for group, settings in groups.items() for key in settings)]
     references = [str(value) for _, value in leaves(config) if "${" in str(value)]
-    own = set(re.findall(r"[\w-]+", " ".join(references))) - known_settings()
-    unused = [name for name in names if name not in known_settings() and name.rpartition(".")[2] not in own]
+    referenced = set(re.findall(r"[\w-]+", " ".join(references))) - known_settings()
+    unused = [name for name in names if name not in known_settings() and name.rpartition(".")[2] not in referenced]
     remedies = {name: _remedy(name) for name in unused}
     if lines := [f"nothing uses the setting {name}: {remedy}" for name, remedy in remedies.items() if remedy]:
         raise ValueError("\n".join(lines))

@@ -118,8 +118,8 @@ def load_agent(parts: nn.ModuleDict, path: Path, optional: Collection[str] = ("c
     Raises:
         ValueError: As :func:`load`.
     """
-    held, missing = _manifest(path)["components"], {*optional, *shared(path)}
-    load_parts(parts, [name for name in parts if name not in missing or _component(name) in held], path)
+    components, missing = _manifest(path)["components"], {*optional, *shared(path)}
+    load_parts(parts, [name for name in parts if name not in missing or _component(name) in components], path)
 
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:

@@ -66,17 +66,17 @@ def choose(autocast: bool | str, device: torch.device | str) -> Precision:
         raise ValueError(f"autocast={autocast!r} must be auto, true or false")
     if autocast is False:
         return Precision(False, "autocast=false")
-    told = is_native(device)
+    native = is_native(device)
     if autocast is True:
-        if not told and (ratio := relative_time(device)) > 1:
+        if not native and (ratio := relative_time(device)) > 1:
             warnings.warn(
                 f"autocast=true: on this {_kind(device)} a matrix product takes {ratio:.1f} times as long in bfloat16 "
                 "as in float32; autocast=auto would choose the faster",
                 stacklevel=2,
             )
         return Precision(True, "autocast=true")
-    if told is not None:
-        return Precision(told, f"this {_kind(device)} has {'' if told else 'no '}instructions for bfloat16")
+    if native is not None:
+        return Precision(native, f"this {_kind(device)} has {'' if native else 'no '}instructions for bfloat16")
     ratio = relative_time(device)
     return Precision(ratio <= ADVANTAGE, f"bfloat16 takes {ratio:.2f} times as long on this {_kind(device)}")
 

@@ -87,9 +87,9 @@ def extent(model: mujoco.MjModel) -> float:
     """Return the largest distance of the first body's tree from its centre of mass in the rest pose, in metres."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    own = model.body_rootid[model.geom_bodyid] == 1
-    distances = np.linalg.norm(data.geom_xpos[own] - data.subtree_com[1], axis=-1)
-    return float((distances + model.geom_rbound[own]).max())
+    is_body = model.body_rootid[model.geom_bodyid] == 1
+    distances = np.linalg.norm(data.geom_xpos[is_body] - data.subtree_com[1], axis=-1)
+    return float((distances + model.geom_rbound[is_body]).max())
 
 
 def _extend(model: mujoco.MjModel, plane: int) -> None:

@@ -73,9 +73,9 @@ def find_joints(
         raise MotionFormatError(source.path, f"has no joint {absent[0]!r}: its joints are {', '.join(source.names)}")
     plain = _plain(source.names)
     joints = {
-        part: plain.index(found[0])
+        part: plain.index(spellings[0])
         for part in (*LEGS, *HEAD_AND_ARMS)
-        if (found := [name for name in _spellings(part) if name in plain])
+        if (spellings := [name for name in _spellings(part) if name in plain])
     }
     joints |= {part: source.names.index(name) for part, name in given.items()}
     for part, first in (("root", "hip"), ("chest", "shoulder")):

@@ -107,8 +107,8 @@ def _retargeted(
     motion, missed = solved(body, character, bodies)
     missed = torch.rad2deg(missed)
     _require_within(source.path, missed, kind)
-    found = fit_joints(source.path, character, closed(motion) if loop else motion, rate, kind)
-    return found._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies, missed=missed)
+    fitted = fit_joints(source.path, character, closed(motion) if loop else motion, rate, kind)
+    return fitted._replace(rest_lean=body.lean(), assumed=body.assumed, bodies=bodies, missed=missed)
 
 
 def fit_clip(

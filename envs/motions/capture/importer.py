@@ -65,8 +65,8 @@ def imported(path: str | Path, character: str, **options: Any) -> Import:
 
 def applicable(read: Callable[..., Import]) -> set[str]:
     """Return the names of the options of a format's function."""
-    own = {*inspect.signature(read).parameters} - {"path", "character", "skeletal"}
-    return own | ({*Skeletal.__annotations__} if "skeletal" in inspect.signature(read).parameters else set())
+    named = {*inspect.signature(read).parameters} - {"path", "character", "skeletal"}
+    return named | ({*Skeletal.__annotations__} if "skeletal" in inspect.signature(read).parameters else set())
 
 
 class Skeletal(TypedDict, total=False):
@@ -161,8 +161,8 @@ def import_deepmimic(
     _require_order(quaternion)
     require_map_applies(bodies, character)
     human = character if character in HUMANS else "humanoid"
-    found = fit_joints(path, human, read_deepmimic(path, fps=fps, quaternion=quaternion), rate, "deepmimic")
-    return found if character == human else fit_clip(path, found.clip, character, rate, "deepmimic", bodies)
+    fitted = fit_joints(path, human, read_deepmimic(path, fps=fps, quaternion=quaternion), rate, "deepmimic")
+    return fitted if character == human else fit_clip(path, fitted.clip, character, rate, "deepmimic", bodies)
 
 
 def import_clip(

@@ -115,13 +115,13 @@ def _legs(body: Recording, rest: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return torch.cat([scale * positions[:, :2], scale * height.unsqueeze(-1) + sole], dim=-1)
 
     hips = scaled((body.positions["right_hip"] + body.positions["left_hip"]) / 2)
-    found = {"root": hips + _carried(body.turns["root"], rest["root"] - middle)}
+    targets = {"root": hips + _carried(body.turns["root"], rest["root"] - middle)}
     for side in SIDES:
         hip, knee, ankle = limb(side, LEG)
-        found[hip] = hips + _carried(body.turns["root"], rest[hip] - middle)
-        found[knee] = found[hip] + _carried(from_straight(body, hip, knee), rest[knee] - rest[hip])
-        found[ankle] = scaled(body.positions[ankle])
-    return found
+        targets[hip] = hips + _carried(body.turns["root"], rest[hip] - middle)
+        targets[knee] = targets[hip] + _carried(from_straight(body, hip, knee), rest[knee] - rest[hip])
+        targets[ankle] = scaled(body.positions[ankle])
+    return targets
 
 
 def _upper_body(body: Recording, rest: Mapping[str, Tensor], root: Tensor) -> dict[str, Tensor]:

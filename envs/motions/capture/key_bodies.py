@@ -40,15 +40,15 @@ def key_map(character: str, given: Mapping[str, str] | None = None) -> dict[str,
         raise ValueError(f"the map of bodies has {', '.join(wrong)}: the parts are {', '.join(PARTS)}")
     if absent := [body for body in given.values() if body not in bodies]:
         raise ValueError(f"{character} has no body {', '.join(absent)}: its bodies are {', '.join(bodies)}")
-    found = {"root": bodies[0], **_central(bodies), **_limbs(bodies, CHARACTERS[character].sides)}
-    found |= _feet(character)
-    found |= given
-    if missing := [part for part in LEGS if part not in found]:
+    bodies_by_part = {"root": bodies[0], **_central(bodies), **_limbs(bodies, CHARACTERS[character].sides)}
+    bodies_by_part |= _feet(character)
+    bodies_by_part |= given
+    if missing := [part for part in LEGS if part not in bodies_by_part]:
         raise ValueError(
             f"{character} has no body known as {', '.join(missing)}: write a file with lines such as "
             f"'{missing[0]}: BODY' (--bodies FILE.yaml); its bodies are {', '.join(bodies)}"
         )
-    return {part: found[part] for part in PARTS if part in found}
+    return {part: bodies_by_part[part] for part in PARTS if part in bodies_by_part}
 
 
 def read_key_map(path: str | Path) -> dict[str, str]:
@@ -68,12 +68,12 @@ def read_key_map(path: str | Path) -> dict[str, str]:
 
 def _central(bodies: list[str]) -> dict[str, str]:
     """Find chest and head."""
-    found = {}
+    parts = {}
     for part, words in CENTRAL.items():
         named = [body for word in words for body in bodies[1:] if word in _plain(body)]
         if named:
-            found[part] = named[0]
-    return found
+            parts[part] = named[0]
+    return parts
 
 
 def _limbs(bodies: list[str], sides: Sides) -> dict[str, str]:
@@ -105,14 +105,14 @@ def _has(name: str, word: str, outer: Sequence[str]) -> bool:
 def _feet(character: str) -> dict[str, str]:
     """The feet of a character with one on each side."""
     sides, feet = CHARACTERS[character].sides, CHARACTERS[character].feet
-    found = {}
+    nearest = {}
     for index, side in enumerate(SIDES):
         affixes = tuple(pair[index] for pair in sides)
-        own = [foot for foot in feet if foot.startswith(affixes) or foot.endswith(affixes)]
-        if len(own) != 1:
+        candidates = [foot for foot in feet if foot.startswith(affixes) or foot.endswith(affixes)]
+        if len(candidates) != 1:
             return {}
-        found[f"{side}_ankle"] = own[0]
-    return found
+        nearest[f"{side}_ankle"] = candidates[0]
+    return nearest
 
 
 def _plain(name: str) -> str:

@@ -79,5 +79,7 @@ def _excursions(signal: Tensor) -> tuple[list[tuple[int, int]], list[tuple[int, 
     away = (signal.abs() > SWING).nonzero().squeeze(-1)
     signs = signal[away].sign()
     turns = (signs.diff() != 0).nonzero().squeeze(-1) + 1
-    found = [(int(signs[first]), (int(away[first]), int(away[last - 1]) + 1)) for first, last in pairwise(turns)]
-    return [interval for sign, interval in found if sign > 0], [interval for sign, interval in found if sign < 0]
+    crossings = [(int(signs[first]), (int(away[first]), int(away[last - 1]) + 1)) for first, last in pairwise(turns)]
+    return [interval for sign, interval in crossings if sign > 0], [
+        interval for sign, interval in crossings if sign < 0
+    ]
