@@ -193,7 +193,9 @@ FAULTS = {
         ("shares < self.in_motion", "shares > self.in_motion", "envs/test_initial_states.py"),
         ("if library.character != character", "if False", "envs/test_initial_states.py"),
     ],
-    "torchrl_mcp/adapters/contract.py": [("(returns.mean() - standing)", "returns.mean()", "evaluation/test_rollout.py")],
+    "torchrl_mcp/adapters/contract.py": [
+        ("(returns.mean() - standing)", "returns.mean()", "evaluation/test_rollout.py")
+    ],
     "envs/characters/mirror.py": [
         (
             "BODY_SIGNS = (1, -1, 1, 1, -1, 1, -1,",
