@@ -154,7 +154,9 @@ class CharacterEnv(EnvBase):
         if pin_memory and not torch.cuda.is_available():
             raise ValueError("pin_memory=True needs a CUDA device, but none is available: pass False")
         super().__init__(device=torch.device(device), batch_size=[num_envs])
-        self.num_envs, self.substeps, self.max_episode_steps = num_envs, substeps, max_episode_steps
+        self.num_envs = num_envs
+        self.substeps = substeps
+        self.max_episode_steps = max_episode_steps
         self.control_timestep = substeps * model.opt.timestep
         self.simulation = named(physics)(
             model,
@@ -177,7 +179,8 @@ class CharacterEnv(EnvBase):
         self._observed: dict[str, Tensor] = {}
         self.generator = torch.Generator(self.device)
         self.set_seed(seed)
-        self._dtype, self._pin_memory = dtype, pin_memory
+        self._dtype = dtype
+        self._pin_memory = pin_memory
         self._camera: tuple[tuple[int, int], Camera] | None = None
 
     @abstractmethod
@@ -357,7 +360,8 @@ class CharacterEnv(EnvBase):
 
     def make_specs(self) -> None:
         """Derive the specs from the observation; a task calls this at the end of its constructor."""
-        shape, one = self.batch_size, (self.num_envs, 1)
+        shape = self.batch_size
+        one = (self.num_envs, 1)
         bounds = self._action_bounds().to(self.device, self._dtype)
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
         seen = self._observed_of(ALL)
@@ -418,7 +422,8 @@ class CharacterEnv(EnvBase):
         self.after_step(diverged)
         reward, terminated = self._outcome(diverged)
         if len(diverged):
-            reward[diverged], terminated[diverged] = 0.0, True
+            reward[diverged] = 0.0
+            terminated[diverged] = True
             self.num_diverged += len(diverged)
         for name, place in self._tracked.items():
             self.episode[name].copy_(place)
@@ -434,7 +439,8 @@ class CharacterEnv(EnvBase):
             self.set_seed(seed)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if self._snapshot is not None and mask is None and not set_state:
-            snapshot, self._snapshot = self._snapshot, None
+            snapshot = self._snapshot
+            self._snapshot = None
             return self._reset(snapshot, set_state=True)
         ids = self._everybody if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
         return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})

@@ -51,7 +51,9 @@ class GymnasiumEnv(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": round(1 / self.env.control_timestep)}
         self.render_mode = render_mode
         bounds = self.env.action_spec.space
-        low, high, dtype = bounds.low[0].numpy(), bounds.high[0].numpy(), _dtype(self.env.action_spec)
+        low = bounds.low[0].numpy()
+        high = bounds.high[0].numpy()
+        dtype = _dtype(self.env.action_spec)
         self.action_space = gymnasium.spaces.Box(low, high, dtype=dtype)
         observed = {key: self.env.observation_spec[key] for key in ("observation", "goal")}
         self.observation_space = gymnasium.spaces.Dict(
@@ -84,7 +86,8 @@ class GymnasiumEnv(gymnasium.Env):
         """Take an action."""
         given = TensorDict({"action": torch.as_tensor(action, dtype=self.env.action_spec.dtype).unsqueeze(0)}, [1])
         outcome = self.env.step(given)["next"]
-        terminated, truncated = outcome["terminated"].item(), outcome["truncated"].item()
+        terminated = outcome["terminated"].item()
+        truncated = outcome["truncated"].item()
         return self._observed(outcome), outcome["reward"].item(), terminated, truncated, self._measured(outcome)
 
     def render(self) -> np.ndarray | None:

@@ -44,7 +44,8 @@ def transport_reach(
         left, away = (torch.linalg.vector_norm(position - other, dim=-1) for other in (target, com))
         return reward(*state).masked_fill((left < success_distance) & (away < success_reach), 1.0)
 
-    still, stride = torch.zeros_like(com), speed * timestep
+    still = torch.zeros_like(com)
+    stride = speed * timestep
     standing = num_steps * reward_of(com, still, position, still, target)
     ideal = torch.zeros_like(standing)
     for _ in range(num_steps):
@@ -52,7 +53,8 @@ def transport_reach(
         moved = torch.where(at_hand, _towards(position, target, stride), position)
         walked = _towards(com, moved, stride, stop=CLOSE)
         ideal += reward_of(walked, (walked - com) / timestep, moved, (moved - position) / timestep, target)
-        com, position = walked, moved
+        com = walked
+        position = moved
     return Reach(standing, ideal)
 
 

@@ -43,7 +43,8 @@ class InitialStates:
                 f"initial_states={initial_states!r} is unknown: pass rest, motions, or a weight of at least 0 for each"
             )
         model = character_model(character)
-        self.rest, self.num_velocities = torch.from_numpy(model.qpos0).to(device), model.nv
+        self.rest = torch.from_numpy(model.qpos0).to(device)
+        self.num_velocities = model.nv
         self.in_motion = weights.get("motions", 0.0) / total
         self.library = self._library(character, motions).to(device) if self.in_motion else None
 
@@ -70,7 +71,8 @@ class InitialStates:
             generator: Source of randomness.
         """
         qpos, qvel = self.draw(len(start["qpos"]), generator)
-        start["qpos"][:, : qpos.shape[1]], start["qvel"][:, : qvel.shape[1]] = qpos, qvel
+        start["qpos"][:, : qpos.shape[1]] = qpos
+        start["qvel"][:, : qvel.shape[1]] = qvel
         return start
 
     def poses(self, interval: float = 0.1) -> Tensor:

@@ -105,7 +105,8 @@ class PDCharacterEnv(CharacterEnv):
     ) -> None:
         if character not in CHARACTERS:
             raise ValueError(f"character={character!r} is unknown: pass one of {', '.join(CHARACTERS)}")
-        self.character, self.curriculum = CHARACTERS[character], Curriculum.of(curriculum)
+        self.character = CHARACTERS[character]
+        self.curriculum = Curriculum.of(curriculum)
         weights = self.curriculum.reward_weights
         if weights is not None and len(weights) != self.num_reward_terms:
             raise ValueError(
@@ -156,8 +157,10 @@ class PDCharacterEnv(CharacterEnv):
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
         # Live views, made once. Body 0 is the world; the character's bodies come next, and then the task's objects.
-        own, outputs = slice(1, 1 + len(self._bodies)), self.simulation.outputs
-        self._positions, self._orientations = outputs["xpos"][:, own], outputs["xquat"][:, own]
+        own = slice(1, 1 + len(self._bodies))
+        outputs = self.simulation.outputs
+        self._positions = outputs["xpos"][:, own]
+        self._orientations = outputs["xquat"][:, own]
         self.com = outputs["subtree_com"][:, 1]
         self.track(com=self.com)
         self._geom_heights = as_array(outputs["geom_xpos"])[..., 2]
@@ -203,7 +206,8 @@ class PDCharacterEnv(CharacterEnv):
 
     def pose(self, body: str) -> tuple[Tensor, Tensor]:
         """Position ``(N, 3)`` and orientation ``(N, 4)`` of a body of the scene, by its name, as live views."""
-        index, outputs = self.simulation.model.body(body).id, self.simulation.outputs
+        index = self.simulation.model.body(body).id
+        outputs = self.simulation.outputs
         return outputs["xpos"][:, index], outputs["xquat"][:, index]
 
     def see(self, ids: Tensor | slice) -> tuple[Tensor, Tensor]:
@@ -260,7 +264,8 @@ class PDCharacterEnv(CharacterEnv):
         centres, trees = self._centres
         seen = (*(part[rows] for part in self._seen), centres[rows][:, trees])
         positions, orientations, twists, centres = map(by_component, seen)
-        positions, angular = contiguous(positions), contiguous(twists[:, :3])
+        positions = contiguous(positions)
+        angular = contiguous(twists[:, :3])
         linear = origin_velocities(angular, twists[:, 3:], positions - centres)
         parts = (positions, orientations, linear, angular)
         return BodyStates(*(converted(part, self._dtype).permute(2, 0, 1) for part in parts))

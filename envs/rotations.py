@@ -109,7 +109,8 @@ def slerp(a: Tensor, b: Tensor, fraction: Tensor) -> Tensor:
         fraction: :math:`t`, shape ``(*B)``.
     """
     b = torch.where((a * b).sum(-1, keepdim=True) < 0, -b, b)
-    difference, total = torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1)
+    difference = torch.linalg.vector_norm(a - b, dim=-1)
+    total = torch.linalg.vector_norm(a + b, dim=-1)
     angle = 2 * torch.atan2(difference, total) / torch.pi  # accurate if a and b are close, unlike acos
     whole = torch.sinc(angle)
     before = (1 - fraction) * torch.sinc((1 - fraction) * angle) / whole

@@ -139,9 +139,12 @@ def adapted(
     jointed = {body: name for body, name in names.items() if body != trunk and joints_of(model, body)}
     drives = _drives(spec.compile(), model, jointed, soles, rest, torques or {}, gains or {})
     for body, name in jointed.items():
-        joint, own = spec.joint(name), drives[name]
-        joint.damping[0], joint.stiffness[0] = own.passive, own.spring
-        joint.armature, joint.frictionloss = own.armature, own.friction
+        joint = spec.joint(name)
+        own = drives[name]
+        joint.damping[0] = own.passive
+        joint.stiffness[0] = own.spring
+        joint.armature = own.armature
+        joint.frictionloss = own.friction
         if own.torque_from != PASSIVE:
             _add_servos(spec, name, own, _ranges(model, body, rest))
     return Adapted(
@@ -157,9 +160,11 @@ def adapted(
 
 def _standing(model: mujoco.MjModel, names: Mapping[int, str], rest: Pose) -> mujoco.MjSpec:
     """Build the body in its rest pose on the ground, without servos."""
-    spec, trunk = mujoco.MjSpec(), next(iter(names))
+    spec = mujoco.MjSpec()
+    trunk = next(iter(names))
     spec.compiler.degree = False
-    spec.option.timestep, spec.option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     bodies = {model.body_parentid[trunk]: spec.worldbody}
     for body, name in names.items():
         place, turn = rest.relative(body, trunk)
@@ -193,7 +198,8 @@ def _drives(
     known = {
         body: (*(model.joint(joint).name for joint in joints_of(model, body)), name) for body, name in jointed.items()
     }
-    torque, gain = matched(torques, known, "--torque"), matched(gains, known, "--gain")
+    torque = matched(torques, known, "--torque")
+    gain = matched(gains, known, "--gain")
     soles = [posed.body(foot).id for foot in feet]
     driven = driven_joints(model, rest.data.qpos)
     drives = {}
@@ -291,7 +297,8 @@ def _feet(
 
 def _add_joint(target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: int, rest: Pose) -> None:
     """Add a body's joint."""
-    joints, kinds = joints_of(model, body), kinds_of(model, body)
+    joints = joints_of(model, body)
+    kinds = kinds_of(model, body)
     if not joints or kinds == [FREE]:
         if target.parent.name == "world":
             target.add_freejoint(name=name)
@@ -299,7 +306,9 @@ def _add_joint(target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: i
     joint = target.add_joint(name=name, pos=model.jnt_pos[joints].mean(0), limited=True)
     targets = _ranges(model, body, rest)
     if kinds == [HINGE]:
-        joint.axis, joint.range, joint.ref = model.jnt_axis[joints[0]], targets[0], rest.angle(joints[0])
+        joint.axis = model.jnt_axis[joints[0]]
+        joint.range = targets[0]
+        joint.ref = rest.angle(joints[0])
         joint.springref = model.qpos_spring[model.jnt_qposadr[joints[0]]]
         return
     joint.type = mujoco.mjtJoint.mjJNT_BALL
@@ -308,7 +317,8 @@ def _add_joint(target: mujoco.MjsBody, name: str, model: mujoco.MjModel, body: i
 
 def _ranges(model: mujoco.MjModel, body: int, rest: Pose) -> np.ndarray:
     """Range of a hinge, ``(1, 2)``, or of rotation about x, y and z, to first order, ``(3, 2)``, in radians."""
-    joints, kinds = joints_of(model, body), kinds_of(model, body)
+    joints = joints_of(model, body)
+    kinds = kinds_of(model, body)
     if kinds == [HINGE]:
         return np.array([rest.range(joints[0])])
     if kinds == [BALL]:
@@ -345,7 +355,8 @@ def _add_shapes(target: mujoco.MjsBody, model: mujoco.MjModel, body: int) -> Non
     """Add a body's shapes; decorative shapes of other kinds are left out."""
     touching = _touching(model)
     for geom in np.flatnonzero(model.geom_bodyid == body):
-        kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom].copy()
+        kind = mujoco.mjtGeom(model.geom_type[geom])
+        size = model.geom_size[geom].copy()
         if kind not in KINDS:
             continue
         if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:

@@ -204,7 +204,8 @@ def _root(model: mujoco.MjModel) -> Iterator[Violation]:
 
 def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
     for body in range(2, model.nbody):
-        name, joints = model.body(body).name, joints_of(model, body)
+        name = model.body(body).name
+        joints = joints_of(model, body)
         kinds = kinds_of(model, body)
         if not name:
             parent = model.body(model.body_parentid[body]).name
@@ -265,7 +266,8 @@ def _actuators(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
 
 def _controls(model: mujoco.MjModel, body: int) -> list[str]:
     """Names of the required actuators of a body."""
-    name, kinds = model.body(body).name, kinds_of(model, body)
+    name = model.body(body).name
+    kinds = kinds_of(model, body)
     if not kinds:
         return []
     several = BALL in kinds or len(kinds) > 1
@@ -347,12 +349,15 @@ def _root_height(model: mujoco.MjModel, lowest: float) -> float:
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     """Height of the lowest point of a sphere, capsule or box, or of the bounding box of any other shape."""
-    height, vertical, size = data.geom_xpos[geom, 2], abs(data.geom_xmat[geom, 6:]), model.geom_size[geom]
+    height = data.geom_xpos[geom, 2]
+    vertical = abs(data.geom_xmat[geom, 6:])
+    size = model.geom_size[geom]
     match int(model.geom_type[geom]):
         case mujoco.mjtGeom.mjGEOM_SPHERE:
             return float(height - size[0])
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             return float(height - size[0] - vertical[2] * size[1])
         case _:
-            centre, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            centre = model.geom_aabb[geom, :3]
+            half_sizes = model.geom_aabb[geom, 3:]
             return float(height + data.geom_xmat[geom, 6:] @ centre - vertical @ half_sizes)

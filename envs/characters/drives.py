@@ -85,7 +85,9 @@ def motor(model: mujoco.MjModel, joint: int) -> Motor:
     The torque is limited by the ``forcerange`` of an actuator, the ``ctrlrange`` of a motor, and the
     ``actuatorfrcrange`` of the joint: the smallest counts.
     """
-    torque, gain, damping = 0.0, 0.0, 0.0
+    torque = 0.0
+    gain = 0.0
+    damping = 0.0
     kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     for index in np.flatnonzero((model.actuator_trnid[:, 0] == joint) & np.isin(model.actuator_trntype, kinds)):
         gear, strength, (_, kp, kv) = (
@@ -94,7 +96,8 @@ def motor(model: mujoco.MjModel, joint: int) -> Motor:
             model.actuator_biasprm[index, :3].tolist(),
         )
         if kp == -strength < 0:
-            gain, damping = max(gain, strength * gear**2), max(damping, -kv * gear**2)
+            gain = max(gain, strength * gear**2)
+            damping = max(damping, -kv * gear**2)
         forces = []
         if model.actuator_forcelimited[index]:
             forces.append(float(abs(model.actuator_forcerange[index]).max()))
@@ -177,9 +180,13 @@ def load(model: mujoco.MjModel, body: int, feet: Sequence[int]) -> Load:
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    gravity, total, mass = 9.81, float(model.body_subtreemass[1]), float(model.body_subtreemass[body])
+    gravity = 9.81
+    total = float(model.body_subtreemass[1])
+    mass = float(model.body_subtreemass[body])
     least = LEAST * gravity * total * float(data.xpos[1, 2])
-    anchor, beyond, rest = data.xanchor[joints_of(model, body)[0]], data.subtree_com[body], max(total - mass, 1e-9)
+    anchor = data.xanchor[joints_of(model, body)[0]]
+    beyond = data.subtree_com[body]
+    rest = max(total - mass, 1e-9)
     behind = (total * data.subtree_com[1] - mass * beyond) / rest
     below = [foot for foot in feet if body in line_of(model, foot)]
     if not below or len(below) == len(feet):

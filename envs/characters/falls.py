@@ -21,13 +21,15 @@ def falling_geoms(model: mujoco.MjModel, feet: tuple[str, ...], num_bodies: int)
     collides = torch.tensor(model.geom_contype | model.geom_conaffinity) != 0
     ids = ((owners > 0) & (owners <= num_bodies) & collides & ~torch.isin(owners, others)).nonzero().squeeze(-1)
     kinds = [mujoco.mjtGeom(kind) for kind in model.geom_type[ids.numpy()]]
-    half_sizes, radii = torch.zeros(len(ids), 3, dtype=torch.float64), torch.zeros(len(ids), dtype=torch.float64)
+    half_sizes = torch.zeros(len(ids), 3, dtype=torch.float64)
+    radii = torch.zeros(len(ids), dtype=torch.float64)
     for row, (kind, size) in enumerate(zip(kinds, torch.tensor(model.geom_size[ids.numpy()]), strict=True)):
         match kind:
             case mujoco.mjtGeom.mjGEOM_SPHERE:
                 radii[row] = size[0]
             case mujoco.mjtGeom.mjGEOM_CAPSULE:
-                radii[row], half_sizes[row, 2] = size[0], size[1]
+                radii[row] = size[0]
+                half_sizes[row, 2] = size[1]
             case mujoco.mjtGeom.mjGEOM_BOX:
                 half_sizes[row] = size
             case _:

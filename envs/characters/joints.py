@@ -66,7 +66,8 @@ def joint_layout(character: str) -> JointLayout:
     names = tuple(model.joint(index).name for index in range(model.njnt))
     hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     offsets = torch.from_numpy((model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) * 3)[~hinges]
-    positions, velocities = torch.from_numpy(model.jnt_qposadr).long(), torch.from_numpy(model.jnt_dofadr).long()
+    positions = torch.from_numpy(model.jnt_qposadr).long()
+    velocities = torch.from_numpy(model.jnt_dofadr).long()
     mirror, mirror_sign = _mirror(model, names, CHARACTERS[character].sides)
     return JointLayout(
         names=names,
@@ -86,7 +87,8 @@ def _mirror(model: mujoco.MjModel, names: tuple[str, ...], sides: Sides) -> tupl
 
     A joint without a twin stays where it is: such a character has no mirror images.
     """
-    source, sign = torch.empty(model.nq, dtype=torch.int64), torch.ones(model.nq, dtype=torch.float64)
+    source = torch.empty(model.nq, dtype=torch.int64)
+    sign = torch.ones(model.nq, dtype=torch.float64)
     for joint, name in enumerate(names):
         other = names.index(twin(name, sides)) if twin(name, sides) in names else joint
         here, there = model.jnt_qposadr[joint], model.jnt_qposadr[other]

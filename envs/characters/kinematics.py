@@ -44,14 +44,18 @@ def body_states(character: str, qpos: Tensor, qvel: Tensor) -> BodyStates:
     model = character_model(character)
     data = mujoco.MjData(model)
     frames = len(qpos)
-    positions, orientations = np.empty((frames, model.nbody, 3)), np.empty((frames, model.nbody, 4))
-    twists, centres = np.empty((frames, model.nbody, 6)), np.empty((frames, 1, 3))
+    positions = np.empty((frames, model.nbody, 3))
+    orientations = np.empty((frames, model.nbody, 4))
+    twists = np.empty((frames, model.nbody, 6))
+    centres = np.empty((frames, 1, 3))
     for frame, (data.qpos, data.qvel) in enumerate(zip(qpos.numpy(), qvel.numpy(), strict=True)):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        positions[frame], orientations[frame] = data.xpos, data.xquat
-        twists[frame], centres[frame] = data.cvel, data.subtree_com[1]
+        positions[frame] = data.xpos
+        orientations[frame] = data.xquat
+        twists[frame] = data.cvel
+        centres[frame] = data.subtree_com[1]
     angular, linear, arms = (field.swapaxes(1, 2) for field in (twists[..., :3], twists[..., 3:], positions - centres))
     linear = origin_velocities(angular, linear, arms).swapaxes(1, 2)
     return BodyStates(*(torch.from_numpy(field[:, 1:]) for field in (positions, orientations, linear, twists[..., :3])))

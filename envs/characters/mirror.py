@@ -86,7 +86,8 @@ def without_mirror_image(model: mujoco.MjModel, sides: Sides = SIDES) -> Iterato
         if not name or (other := twin(name, sides)) not in names:
             continue
         there = names.index(other)
-        image, frame = REFLECTION @ data.xmat[there].reshape(3, 3) @ REFLECTION, data.xmat[body].reshape(3, 3)
+        image = REFLECTION @ data.xmat[there].reshape(3, 3) @ REFLECTION
+        frame = data.xmat[body].reshape(3, 3)
         alike = (float((image * frame).sum()) - 1) / 2 > ALIKE
         if kinds := _kinds(model, body):
             place, other_place = data.xpos[[body, there]] - data.xpos[1]

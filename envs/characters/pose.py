@@ -54,11 +54,14 @@ class Pose(NamedTuple):
 
     def relative(self, body: int, root: int) -> tuple[np.ndarray, np.ndarray]:
         """Position and orientation of a body in its parent; of the root in the world, above the origin."""
-        position, turn = self.data.xpos[body].copy(), self.data.xquat[body].copy()
+        position = self.data.xpos[body].copy()
+        turn = self.data.xquat[body].copy()
         if body == root:
             return position * [0, 0, 1], turn
         parent = self.model.body_parentid[body]
-        back, place, relative = np.empty(4), np.empty(3), np.empty(4)
+        back = np.empty(4)
+        place = np.empty(3)
+        relative = np.empty(4)
         mujoco.mju_negQuat(back, self.data.xquat[parent])
         mujoco.mju_rotVecQuat(place, position - self.data.xpos[parent], back)
         mujoco.mju_mulQuat(relative, back, turn)

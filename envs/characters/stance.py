@@ -42,7 +42,8 @@ def collapse(spec: mujoco.MjSpec, feet: tuple[str, ...], *, seconds: float = SEC
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     data.ctrl[:] = rest_controls(model)
-    height, upright = data.xpos[1, 2], data.xmat[1].reshape(3, 3)[2].copy()
+    height = data.xpos[1, 2]
+    upright = data.xmat[1].reshape(3, 3)[2].copy()
     falling, half_sizes, radii = (part.numpy() for part in falling_geoms(model, feet, model.nbody - 1))
     steps = round(seconds / model.opt.timestep)
     for step in range(1, steps + 1):

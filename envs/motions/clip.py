@@ -110,7 +110,9 @@ class MotionClip:
             times: Seconds since the first frame, shape ``(*B)``; held at the ends unless the clip loops.
         """
         frame, fraction, cycles = self._locate(times)
-        before, after, quaternions = self.qpos[frame], self.qpos[frame + 1], self.layout.quaternions
+        before = self.qpos[frame]
+        after = self.qpos[frame + 1]
+        quaternions = self.layout.quaternions
         qpos = torch.lerp(before, after, fraction.unsqueeze(-1))
         qpos[..., quaternions] = slerp(before[..., quaternions], after[..., quaternions], fraction.unsqueeze(-1))
         return self.cycle.power(cycles).qpos(qpos) if self.loop else qpos
@@ -184,7 +186,8 @@ class MotionClip:
     def _from_arrays(cls, path: str | Path, arrays: Mapping[str, np.ndarray]) -> Self:
         if missing := {"character", "joints", "qpos", "fps", "loop"} - set(arrays):
             raise ValueError(f"it lacks {sorted(missing)}")
-        character, joints = str(arrays["character"]), tuple(map(str, arrays["joints"]))
+        character = str(arrays["character"])
+        joints = tuple(map(str, arrays["joints"]))
         if character not in CHARACTERS:
             raise MotionFormatError(
                 path,
@@ -250,7 +253,8 @@ def differences(qpos: Tensor, layout: JointLayout) -> Tensor:
 def _gap(qpos: Tensor, layout: JointLayout) -> float:
     """Greatest angle in radians of a joint between the first and the last state."""
     first, last = qpos[0], qpos[-1]
-    hinges, balls = last[layout.angles] - first[layout.angles], layout.quaternions[1:]
+    hinges = last[layout.angles] - first[layout.angles]
+    balls = layout.quaternions[1:]
     turns = to_rotation_vector(multiply(inverse(first[balls]), last[balls])).norm(dim=-1)
     return float(torch.cat([torch.atan2(hinges.sin(), hinges.cos()).abs(), turns, hinges.new_zeros(1)]).max())
 

@@ -82,7 +82,8 @@ def contact_points(character: str, body: str, states: BodyStates) -> ContactPoin
 
 def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
     """Points ``(P, 3)`` in the frame of a body, and the radii ``(P,)`` of round shapes about them."""
-    points, radii = [], []
+    points = []
+    radii = []
     owner = model.body(body)
     for index in range(owner.geomadr[0], owner.geomadr[0] + owner.geomnum[0]):
         geom = model.geom(index)
@@ -91,11 +92,14 @@ def _outline(model: mujoco.MjModel, body: str) -> tuple[Tensor, Tensor]:
         size = geom.size
         match geom.type[0]:
             case mujoco.mjtGeom.mjGEOM_SPHERE:
-                local, radius = np.zeros((1, 3)), size[0]
+                local = np.zeros((1, 3))
+                radius = size[0]
             case mujoco.mjtGeom.mjGEOM_CAPSULE:
-                local, radius = np.array([[0, 0, -size[1]], [0, 0, size[1]]]), size[0]
+                local = np.array([[0, 0, -size[1]], [0, 0, size[1]]])
+                radius = size[0]
             case _:
-                local, radius = size * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(8, 3), 0.0
+                local = size * np.stack(np.meshgrid(*[[-1, 1]] * 3), axis=-1).reshape(8, 3)
+                radius = 0.0
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, geom.quat)
         points.append(geom.pos + local @ matrix.reshape(3, 3).T)

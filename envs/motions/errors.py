@@ -17,7 +17,8 @@ class MotionFormatError(ValueError):
     """
 
     def __init__(self, path: str | Path, message: str, line: int | None = None) -> None:
-        self.path, self.line = Path(path), line
+        self.path = Path(path)
+        self.line = line
         super().__init__(f"{path}: {message}" if line is None else f"{path}:{line}: {message}")
 
 

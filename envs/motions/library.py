@@ -39,7 +39,8 @@ class PlacedMotion:
     """
 
     def __init__(self, moment: MotionState, placement: Placement | None) -> None:
-        self.moment, self.placement = moment, placement
+        self.moment = moment
+        self.placement = placement
         if placement is not None:
             self._each = Placement(placement.turn.unsqueeze(-1), placement.shift.unsqueeze(-2))
 
@@ -120,7 +121,8 @@ class MotionLibrary:
     ) -> None:
         if len(characters := sorted({clip.character for clip in clips.values()})) != 1:
             raise ValueError(f"clips are of {characters or 'no character'}: pass one or more, all of one character")
-        self.character, self.names = characters[0], list(clips)
+        self.character = characters[0]
+        self.names = list(clips)
         self.body_names = body_names(self.character)
         self.durations = torch.tensor([clip.duration for clip in clips.values()], dtype=torch.float64)
         """Seconds of each clip, or of one cycle if it loops, shape ``(C,)``."""
@@ -132,7 +134,8 @@ class MotionLibrary:
         """SHA-256 of clips and weights, with which a checkpoint identifies its motions."""
         self._fps = torch.tensor([clip.fps for clip in clips.values()], dtype=torch.float64)
         lengths = torch.tensor([len(clip.qpos) for clip in clips.values()])
-        self._last, self._start = lengths - 1, lengths.cumsum(0) - lengths
+        self._last = lengths - 1
+        self._start = lengths.cumsum(0) - lengths
         first = torch.stack([clip.qpos[0] for clip in clips.values()])
         self._cycles = placing(first, torch.stack([clip.qpos[-1] for clip in clips.values()]))
         layout = joint_layout(self.character)
@@ -169,7 +172,8 @@ class MotionLibrary:
         cycles = torch.where(self.loops[clips], torch.floor(frames / last), 0.0)
         frames = torch.minimum((frames - cycles * last).clamp_min(0.0), last)
         whole = torch.minimum(frames.long(), last - 1)
-        rows, fraction = self._start[clips] + whole, (frames - whole).to(self._table.dtype)
+        rows = self._start[clips] + whole
+        fraction = (frames - whole).to(self._table.dtype)
         before, after = self._table.index_select(0, rows), self._table.index_select(0, rows + 1)
         moments = torch.lerp(before, after, fraction.unsqueeze(-1)).split(self._sizes, dim=-1)
         quaternions = moments[0].unflatten(-1, (4, -1))
@@ -212,7 +216,8 @@ def _rows(clip: MotionClip) -> list[Tensor]:
     These are quaternions of joints and bodies, root position and hinges, positions and velocities of bodies, and
     ``qvel``. Vectors and quaternions are stored by component, which is several times as fast as by body.
     """
-    layout, bodies = clip.layout, body_states(clip.character, clip.qpos, clip.qvel)
+    layout = clip.layout
+    bodies = body_states(clip.character, clip.qpos, clip.qvel)
     turns = continuous(torch.cat([clip.qpos[:, layout.quaternions], bodies.orientations], dim=1).transpose(0, 1))
     others = torch.cat([clip.qpos[:, :3], clip.qpos[:, layout.angles]], dim=-1)
     vectors = (bodies.positions, bodies.linear_velocities, bodies.angular_velocities)

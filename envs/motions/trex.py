@@ -128,9 +128,11 @@ def trex_walk(speed: float, turn_rate: float) -> MotionClip:
     if not abs(turn_rate) * duration < torch.pi:
         raise ValueError(f"turn_rate={turn_rate} turns a loop half around: pass less than {torch.pi / duration:.2f}")
     time = torch.arange(round(duration * FPS) + 1, dtype=torch.float64) / FPS
-    phase, path = time / STRIDE_TIME, _path(time, speed, turn_rate)
+    phase = time / STRIDE_TIME
+    path = _path(time, speed, turn_rate)
     place, pelvis = _pelvis(phase, speed, turn_rate)
-    position, orientation = path.points(place), path.quaternions(pelvis)
+    position = path.points(place)
+    orientation = path.quaternions(pelvis)
     still = about_z(torch.zeros_like(phase))
     joints = {
         **_front(phase, place, pelvis, turn_rate),
@@ -164,7 +166,8 @@ def _width(speed: float) -> float:
 
 def _pelvis(phase: Tensor, speed: float, turn_rate: float) -> tuple[Tensor, Tensor]:
     """Position ``(T, 3)`` and orientation ``(T, 4)`` of the pelvis relative to the path."""
-    surge, sway = _walking(speed) * smooth(SURGE, phase), _width(speed) / STEP_WIDTH * smooth(SWAY, phase)
+    surge = _walking(speed) * smooth(SURGE, phase)
+    sway = _width(speed) / STEP_WIDTH * smooth(SWAY, phase)
     place = torch.stack([surge, sway, HEIGHT + smooth(BOB, phase)], dim=-1)
     lean = speed * turn_rate / GRAVITY
     return place, multiply(about_z(smooth(PELVIS_YAW, phase)), about_x(smooth(PELVIS_ROLL, phase) - LEAN * lean))
@@ -201,7 +204,8 @@ def _step(side: str, phase: Tensor, speed: float, turn_rate: float) -> Step:
     """
     start = 0.0 if side == "right" else 0.5
     elapsed = phase - start
-    count, elapsed = elapsed.floor(), elapsed % 1
+    count = elapsed.floor()
+    elapsed = elapsed % 1
     progress = minimum_jerk((elapsed - SWING[0]) / (SWING[1] - SWING[0]))
     ground = _plant(side, start + count + progress, speed, turn_rate)
     pitch, lift, aside = (halting(keyframes, elapsed) for keyframes in (FOOT_PITCH, FOOT_LIFT, FOOT_ASIDE))
@@ -248,7 +252,8 @@ def _leg(side: str, position: Tensor, orientation: Tensor, heading: Tensor, step
         _bone(f"{side}_{end}") for end in ("knee", "ankle", "toe")
     )
     foot_angle = torch.atan2(x, down) + smooth(METATARSUS, step.phase)
-    x, down = x - metatarsus * foot_angle.sin(), down - metatarsus * foot_angle.cos()
+    x = x - metatarsus * foot_angle.sin()
+    down = down - metatarsus * foot_angle.cos()
     line = torch.hypot(x, down)
     hip_angle = torch.atan2(x, down) + torch.acos((thigh**2 + line**2 - shank**2) / (2 * thigh * line))
     knee_angle = torch.atan2(x - thigh * hip_angle.sin(), down - thigh * hip_angle.cos())

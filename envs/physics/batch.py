@@ -53,7 +53,8 @@ class BatchSimulation(Simulation):
         self.state = {name: torch.from_numpy(field) for name, field in self._fields.items()}
         self._model_fields = tuple(model_fields)
         self._rows = self._batch.state[:, : sum(fields[name][0].size for name in CHANGING_FIELDS)]
-        self._initial, self._before = self._batch.state[0].copy(), np.empty_like(self._rows)
+        self._initial = self._batch.state[0].copy()
+        self._before = np.empty_like(self._rows)
         sensors = ["sensordata"] if model.nsensordata else []
         self.outputs = {name: _view(self._batch.bind(name)) for name in (*outputs, *sensors)}
         self._num_contacts = self._batch.bind("ncon")

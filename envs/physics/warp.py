@@ -64,11 +64,15 @@ class WarpSimulation(Simulation):
         contacts: int | None = None,
         constraints: int | None = None,
     ) -> None:
-        self.model, self.substeps, self.physics_seconds = copy.copy(model), substeps, 0.0
+        self.model = copy.copy(model)
+        self.substeps = substeps
+        self.physics_seconds = 0.0
         self.model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # Warp has no automatic reset
-        self._current, self._model_fields = current, tuple(model_fields)
+        self._current = current
+        self._model_fields = tuple(model_fields)
         wp.init()
-        self._device, self._torch_device = wp.device_from_torch(device), device
+        self._device = wp.device_from_torch(device)
+        self._torch_device = device
         room = contact_room(model) if contacts is None else contacts
         rows = constraint_room(model, room) if constraints is None else constraints
         with wp.ScopedDevice(self._device):
@@ -126,7 +130,8 @@ class WarpSimulation(Simulation):
         model = copy.copy(self.model)
         data = mujoco.MjData(model)
         for name, field in self.state.items():
-            owner, value = model if name in self._model_fields else data, field[index].double().cpu().numpy()
+            owner = model if name in self._model_fields else data
+            value = field[index].double().cpu().numpy()
             if name == "time":
                 data.time = float(value)
             else:
@@ -139,9 +144,12 @@ class WarpSimulation(Simulation):
         with wp.ScopedDevice(self._device):
             arrays = [self._arrays[name] for name in CHANGING_FIELDS if name in self._arrays]
             self._changing = [(array, wp.empty_like(array)) for array in arrays]
-            self._asked, self._faulted = wp.zeros_like(self._data.ctrl), wp.zeros(num_envs, dtype=int)
-            self._controls, self._faults = _view(self._asked), _view(self._faulted)
-            self._step, self._outputs = self._recorded(self._advance), self._recorded(self._compute_outputs)
+            self._asked = wp.zeros_like(self._data.ctrl)
+            self._faulted = wp.zeros(num_envs, dtype=int)
+            self._controls = _view(self._asked)
+            self._faults = _view(self._faulted)
+            self._step = self._recorded(self._advance)
+            self._outputs = self._recorded(self._compute_outputs)
             self._force = self._recorded(partial(mjw.rne_postconstraint, self._model, self._data))
         for name, value in self._initial.items():  # recording takes a step
             self.state[name].copy_(value.expand_as(self.state[name]))
@@ -169,7 +177,9 @@ class WarpSimulation(Simulation):
 
     def _advance(self) -> None:
         """Take the physics steps of an action, and undo them in simulations that fault."""
-        data, faults, worlds = self._data, self._faulted, self._data.nworld
+        data = self._data
+        faults = self._faulted
+        worlds = self._data.nworld
         for now, before in self._changing:
             wp.copy(before, now)
         wp.copy(data.ctrl, self._asked)
@@ -234,7 +244,8 @@ def constraint_room(model: mujoco.MjModel, contacts: int) -> int:
     """Return the number of constraints of ``contacts``, of all joints at their limits and of all equalities."""
     dimensions = int(model.geom_condim.max())
     rows = 2 * (dimensions - 1) if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL else dimensions
-    limits, frictions = int(model.jnt_limited.sum()), int((model.dof_frictionloss > 0).sum())
+    limits = int(model.jnt_limited.sum())
+    frictions = int((model.dof_frictionloss > 0).sum())
     return max(rows, 1) * contacts + limits + frictions + 6 * int(model.neq)
 
 

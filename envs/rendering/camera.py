@@ -49,7 +49,8 @@ class Shape(NamedTuple):
 
 def arrow(tail: np.ndarray, tip: np.ndarray, colour: Colour = RED) -> Shape:
     """Return an arrow from ``tail`` to ``tip``, each ``(3,)``, in metres."""
-    geom, kind = mujoco.MjvGeom(), mujoco.mjtGeom.mjGEOM_ARROW
+    geom = mujoco.MjvGeom()
+    kind = mujoco.mjtGeom.mjGEOM_ARROW
     mujoco.mjv_connector(geom, kind, 0.05, tail, tip)
     return Shape(kind, geom.size, geom.pos, geom.mat.flatten(), np.array(colour, np.float32))
 
@@ -96,7 +97,8 @@ class Camera:
 
     def __init__(self, model: mujoco.MjModel, *, width: int, height: int, body: int = 1) -> None:
         buffer = model.vis.global_
-        buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
+        buffer.offwidth = max(buffer.offwidth, width)
+        buffer.offheight = max(buffer.offheight, height)
         self._opengl = new_context(width, height)
         self._opengl.make_current()
         try:
@@ -105,7 +107,8 @@ class Camera:
             self._opengl.free()
             raise ValueError(f"OpenGL cannot draw width={width}, height={height}: pass less ({error})") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._model, self._size = model, mujoco.MjrRect(0, 0, width, height)
+        self._model = model
+        self._size = mujoco.MjrRect(0, 0, width, height)
         self.scene = mujoco.MjvScene(model, MAX_SHAPES)
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
@@ -117,7 +120,8 @@ class Camera:
     ) -> Tensor:
         """Draw the simulation from ``distance`` metres, shape ``(height, width, 3)``, uint8."""
         self.view.distance = distance
-        option, everything = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
+        option = mujoco.MjvOption()
+        everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, data, option, None, self.view, everything, self.scene)
         add_shapes(self.scene, [*(arrow(*ends) for ends in arrows), *shapes])
         pixels = np.empty((self._size.height, self._size.width, 3), np.uint8)
@@ -136,7 +140,8 @@ class Camera:
 def save_gif(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
     """Write RGB pictures as an animated GIF, one every ``interval`` seconds."""
     # An octree preserves the colours of small areas.
-    octree, plain = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+    octree = Image.Quantize.FASTOCTREE
+    plain = Image.Dither.NONE
     first, *others = (picture.quantize(GIF_COLOURS, octree, dither=plain) for picture in pictures)
     # A GIF counts in hundredths of a second: rounding errors carry over to the next picture.
     ticks = [round(100 * interval * number) for number in range(len(others) + 2)]

@@ -29,6 +29,7 @@ def add_ground(spec: mujoco.MjSpec) -> None:
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground", contype=1, conaffinity=1
     )
     # The light follows the character, because MuJoCo draws shadows only near the lit point.
-    sun, follow = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, mujoco.mjtCamLight.mjCAMLIGHT_TRACK
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    follow = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
     spec.bodies[1].add_light(name="sun", type=sun, mode=follow, pos=[3, -4, 10], dir=[-0.3, 0.4, -1])
     spec.visual.map.shadowclip = 20.0  # beyond the shadow map the ground is speckled

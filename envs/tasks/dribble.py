@@ -110,7 +110,8 @@ class Dribble(Transport):
 def add_pitch(spec: mujoco.MjSpec) -> None:
     """Add a target on the ground without collisions, and the ball."""
     target = spec.worldbody.add_body(name="target", mocap=True)
-    disc, ghost = mujoco.mjtGeom.mjGEOM_CYLINDER, {"contype": 0, "conaffinity": 0}
+    disc = mujoco.mjtGeom.mjGEOM_CYLINDER
+    ghost = {"contype": 0, "conaffinity": 0}
     target.add_geom(type=disc, size=[SUCCESS_DISTANCE, 0.002, 0], rgba=[0.9, 0.1, 0.1, 0.5], **ghost)
     target.add_geom(type=disc, size=[0.03, 0.75, 0], pos=[0, 0, 0.75], rgba=[0.9, 0.1, 0.1, 1], **ghost)
     add_ball(spec)
@@ -124,7 +125,8 @@ def add_ball(spec: mujoco.MjSpec) -> None:
     """
     ball = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
     for name, axis, at in zip("xyz", np.eye(3), ball.pos, strict=True):
-        slide, damping = mujoco.mjtJoint.mjJNT_SLIDE, [MASS * DAMPING, 0, 0]
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        damping = [MASS * DAMPING, 0, 0]
         ball.add_joint(name=f"ball_{name}", type=slide, axis=axis, ref=at, damping=damping, armature=0)
     damping = [0.4 * MASS * RADIUS**2 * DAMPING, 0, 0]
     ball.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, damping=damping, armature=0)

@@ -80,7 +80,9 @@ class Heading(PDCharacterEnv):
         not_negative(max_turn=max_turn)
         if not speed_interval > 0:
             raise ValueError(f"speed_interval={speed_interval} is out of range: pass seconds, or inf for no changes")
-        self.max_turn, self.speeds, self.waypoint = max_turn, _speeds(speed), waypoint
+        self.max_turn = max_turn
+        self.speeds = _speeds(speed)
+        self.waypoint = waypoint
         shown = 3 if self.changes_speed else 2
         self.goal_layout = {"direction": slice(0, 2)}
         if self.changes_speed:
@@ -132,7 +134,8 @@ class Heading(PDCharacterEnv):
             turns[0] = 0.0
         self.episode["direction"] += turns
         if self.changes_speed:
-            speed, another = self.episode["speed"], self._uniform(self.num_envs, *self.speeds)
+            speed = self.episode["speed"]
+            another = self._uniform(self.num_envs, *self.speeds)
             changes = self._uniform(self.num_envs, 0.0, 1.0) < self.change_probability
             if self._steered:
                 changes[0] = False
@@ -167,7 +170,8 @@ class Heading(PDCharacterEnv):
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
-        speed, place = [1] * self.changes_speed, VECTOR_SIGNS * self.waypoint
+        speed = [1] * self.changes_speed
+        place = VECTOR_SIGNS * self.waypoint
         return mirror_signs([*VECTOR_SIGNS, *speed, *place])
 
     def arrows(self, index: int) -> list[Arrow]:

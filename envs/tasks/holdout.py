@@ -108,7 +108,8 @@ class Holdout(CharacterEnv):
             reset_noise_scale=reset_noise_scale,
         )
         spec = ant()
-        model, self.scene = spec.compile(), spec.to_xml()
+        model = spec.compile()
+        self.scene = spec.to_xml()
         episode = {"goal": torch.zeros(2, dtype=dtype)}
         if contact_forces:
             episode["contact_forces"] = torch.zeros(model.nbody, 6, dtype=torch.float64)
@@ -123,8 +124,10 @@ class Holdout(CharacterEnv):
             dtype=dtype,
             **kwargs,
         )
-        self.directions, self.reset_noise_scale = directions, reset_noise_scale
-        self.healthy_z_range, self.terminate_when_unhealthy = healthy_z_range, terminate_when_unhealthy
+        self.directions = directions
+        self.reset_noise_scale = reset_noise_scale
+        self.healthy_z_range = healthy_z_range
+        self.terminate_when_unhealthy = terminate_when_unhealthy
         self._reward_of = partial(
             holdout_reward,
             forward_weight=forward_weight,
@@ -134,8 +137,10 @@ class Holdout(CharacterEnv):
         )
         # Live views, made once. Gymnasium measures velocities with the body's xpos, one stage of RK4 before the state.
         self._rest = torch.from_numpy(model.qpos0).to(self.device)
-        qpos, self._qvel = self.simulation.state["qpos"], self.simulation.state["qvel"]
-        self._height, self._posture = qpos[:, 2], qpos[:, 2:]
+        qpos = self.simulation.state["qpos"]
+        self._qvel = self.simulation.state["qvel"]
+        self._height = qpos[:, 2]
+        self._posture = qpos[:, 2:]
         self.track(position=self.simulation.outputs["xpos"][:, TORSO, :2])
         self.observation_layout = _layout(model, contact_forces)
         self.make_specs()
@@ -164,13 +169,16 @@ class Holdout(CharacterEnv):
     def reach(self) -> Reach:
         """See :meth:`CharacterEnv.reach`: the ideal is Gymnasium's threshold for solved, which can be exceeded."""
         still = torch.zeros(self.num_envs, 2, device=self.device)
-        action, healthy = torch.zeros_like(self.simulation.state["ctrl"]), torch.ones_like(still[:, 0])
+        action = torch.zeros_like(self.simulation.state["ctrl"])
+        healthy = torch.ones_like(still[:, 0])
         standing = self.max_episode_steps * self._reward_of(still, self.episode["goal"], action, healthy)
         return Reach(standing, torch.full_like(standing, self._solved()))
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The ant near its rest pose, and a direction."""
-        model, noise, source = self.simulation.model, self.reset_noise_scale, self.generator
+        model = self.simulation.model
+        noise = self.reset_noise_scale
+        source = self.generator
         blank = partial(torch.empty, dtype=torch.float64, device=self.device)
         angle = blank(num, 1).uniform_(*self.directions, generator=source)
         shift = blank(num, model.nq).uniform_(-noise, noise, generator=source)

@@ -135,11 +135,13 @@ class Imitation(PDCharacterEnv):
             raise ValueError(f"switch_to={switch_to!r} is unknown: pass {' or '.join(SWITCHES)}")
         if clip_end not in CLIP_ENDS:
             raise ValueError(f"clip_end={clip_end!r} is unknown: pass {' or '.join(CLIP_ENDS)}")
-        self.max_error, self.clip_end = max_error, clip_end
+        self.max_error = max_error
+        self.clip_end = clip_end
         self.terms = checked_terms(terms)
         if "key_positions" in terms and not CHARACTERS[character].key_bodies:
             raise ValueError(f"terms names key_positions, but character={character!r} has no key_bodies: name some")
-        self.switch_candidates, self.switch_to = switch_candidates, switch_to
+        self.switch_candidates = switch_candidates
+        self.switch_to = switch_to
         self.switch_probability = CONTROL_TIMESTEP / switch_interval
         names = library.body_names
         reference = {
@@ -154,14 +156,17 @@ class Imitation(PDCharacterEnv):
             character, num_envs, max_episode_steps=max_episode_steps, episode=reference, curriculum=None, **kwargs
         )
         self.goal_layout = bodies_layout([f"step_{step + 1}.{name}" for step in range(NUM_TARGETS) for name in names])
-        self.library, self._layout = library.to(self.device), joint_layout(character).to(self.device)
+        self.library = library.to(self.device)
+        self._layout = joint_layout(character).to(self.device)
         self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
         ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
         self._ahead = ahead.unsqueeze(-1).to(self.device)
         self._horizontal = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device=self.device)
-        model, own = self.simulation.model, slice(1, 1 + len(self._bodies))
+        model = self.simulation.model
+        own = slice(1, 1 + len(self._bodies))
         masses, centres = (torch.from_numpy(field[own]) for field in (model.body_mass, model.body_ipos))
-        self._masses, self._centres_of_mass = masses.to(self.device), centres.to(self.device)
+        self._masses = masses.to(self.device)
+        self._centres_of_mass = centres.to(self.device)
         self.make_specs()
         for name in self.terms:
             self._error(name, self._next)
@@ -182,8 +187,10 @@ class Imitation(PDCharacterEnv):
             clips: Index of each clip in ``library``, shape ``(n,)``, int64.
             times: Seconds since the clip's first frame, shape ``(n,)``, float64.
         """
-        num, moment = len(clips), self.library.at(clips, times)
-        turn, shift = torch.zeros_like(times), -moment.qpos[:, :2]
+        num = len(clips)
+        moment = self.library.at(clips, times)
+        turn = torch.zeros_like(times)
+        shift = -moment.qpos[:, :2]
         return {
             "qpos": torch.cat([torch.zeros_like(shift), moment.qpos[:, 2:]], -1),
             "qvel": moment.qvel,
@@ -229,7 +236,8 @@ class Imitation(PDCharacterEnv):
 
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """State of the character, and the next states of the reference as the character sees them."""
-        angle, place = self.heading(ids), self._positions[ids, 0]
+        angle = self.heading(ids)
+        place = self._positions[ids, 0]
         targets = self._look_ahead(ids)
         placement = cast("Placement", targets.placement)
         # Equivalent to moving the reference to the character: view the clip from the character's place in its frame.
@@ -248,7 +256,8 @@ class Imitation(PDCharacterEnv):
     def _look_ahead(self, ids: Tensor | slice) -> PlacedMotion:
         """References of n simulations in the next steps, ordered by step, ``(NUM_TARGETS * n, ...)``."""
         clip, time, turn, shift = (self.episode[key][ids] for key in ("clip", "time", "turn", "shift"))
-        num, times = len(clip), (time + self._ahead).flatten()
+        num = len(clip)
+        times = (time + self._ahead).flatten()
         placement = Placement(turn.repeat(NUM_TARGETS), shift.repeat(NUM_TARGETS, 1))
         targets = self.library.at(clip.repeat(NUM_TARGETS), times, placement)
         first = targets[:num]
@@ -300,8 +309,11 @@ class Imitation(PDCharacterEnv):
 
     def _error(self, name: str, reference: PlacedMotion) -> Tensor:
         """One of ``ERRORS`` between character and reference, ``(N,)``."""
-        qpos, qvel, layout = self.simulation.state["qpos"], self.simulation.state["qvel"], self._layout
-        positions, targets = self._positions, reference.positions
+        qpos = self.simulation.state["qpos"]
+        qvel = self.simulation.state["qvel"]
+        layout = self._layout
+        positions = self._positions
+        targets = reference.positions
         match name:
             case "pose":
                 turns = squared_angles(qpos[:, layout.quaternions[1:]], reference.qpos[:, layout.quaternions[1:]])

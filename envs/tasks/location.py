@@ -90,11 +90,13 @@ class Location(PDCharacterEnv):
         **kwargs: Any,
     ) -> None:
         positive(speed=speed)
-        self.speed, self.faces = speed, final_directions is not None
+        self.speed = speed
+        self.faces = final_directions is not None
         self.goal_layout = {"place": slice(0, 2)}
         if self.faces:
             self.goal_layout["final_direction"] = slice(2, 4)
-        number, no = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool)
+        number = torch.zeros((), dtype=torch.float64)
+        no = torch.zeros((), dtype=torch.bool)
         episode = {"target": number.repeat(2), "final_direction": number, "seconds_left": number}
         super().__init__(
             character,
@@ -182,7 +184,8 @@ class Location(PDCharacterEnv):
         """
         if not self.one_place:
             return None
-        still, offset = torch.zeros_like(self._offset()), self._offset()
+        still = torch.zeros_like(self._offset())
+        offset = self._offset()
         standing = self.max_episode_steps * location_reward(still, offset, self.speed, self._alignment())
         times = torch.arange(1, self.max_episode_steps + 1, device=self.device) * self.control_timestep
         left = (torch.linalg.vector_norm(offset, dim=-1, keepdim=True) - self.speed * times).clamp(min=0.0)

@@ -52,7 +52,8 @@ class Ranges:
 
     def to(self, device: torch.device) -> Self:
         """Move the ranges to the generator's device, and return them."""
-        self._bounds, self._weights = self._bounds.to(device), self._weights.to(device)
+        self._bounds = self._bounds.to(device)
+        self._weights = self._weights.to(device)
         return self
 
     def require_distances(self, *names: str) -> None:

@@ -35,8 +35,10 @@ def height_of(spec: mujoco.MjSpec, body: str) -> float:
 
 def add_table(spec: mujoco.MjSpec, name: str, height: float, rgba: tuple[float, float, float, float]) -> None:
     """Add a table; its position is the middle of its top, ``height`` above the ground."""
-    table, box = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, height]), mujoco.mjtGeom.mjGEOM_BOX
-    top, leg = TOP_THICKNESS / 2, (height - TOP_THICKNESS) / 2
+    table = spec.worldbody.add_body(name=name, mocap=True, pos=[0, 0, height])
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    top = TOP_THICKNESS / 2
+    leg = (height - TOP_THICKNESS) / 2
     size = [TOP_HALF_SIZE, TOP_HALF_SIZE, top]
     table.add_geom(type=box, size=size, pos=[0, 0, -top], rgba=rgba, contype=TOP_CONTACT, conaffinity=0)
     place = [0, 0, leg - height]

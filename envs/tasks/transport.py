@@ -242,7 +242,8 @@ class Transport(PDCharacterEnv):
 
 def goal_layout(sizes: Mapping[str, int], waypoint: bool) -> dict[str, slice]:
     """Slices of the goal by object and quantity, from the number of entries of each object, and of the waypoint."""
-    layout, start = {}, 0
+    layout = {}
+    start = 0
     for name, shown in sizes.items():
         end = start + shown
         for quantity, size in SIZES.items():

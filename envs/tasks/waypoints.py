@@ -83,8 +83,10 @@ def dribble_waypoint(com: Tensor, ball: Tensor, rest: Tensor, target: Tensor) ->
     Returns:
         Places, ``(N, 2)``.
     """
-    now, ball = ball, (ball + rest) / 2
-    way, approach = target - ball, normalize(ball - com, dim=-1)
+    now = ball
+    ball = (ball + rest) / 2
+    way = target - ball
+    approach = normalize(ball - com, dim=-1)
     onward = normalize(way, dim=-1)
     left = torch.stack([-onward[:, 1], onward[:, 0]], -1)
     alignment = (approach * onward).sum(-1, keepdim=True)
@@ -129,7 +131,8 @@ def walkable(offset: Tensor) -> Tensor:
     Returns:
         Places in the same frame, ``(*B, 2)``, in metres.
     """
-    angle, distance = torch.atan2(offset[..., 1], offset[..., 0]), torch.linalg.vector_norm(offset, dim=-1)
+    angle = torch.atan2(offset[..., 1], offset[..., 0])
+    distance = torch.linalg.vector_norm(offset, dim=-1)
     on_arc = steps(torch.full_like(distance, STEP), ASIDE * angle.sign())
     aside, far, reached = (
         flag.unsqueeze(-1) for flag in (angle.abs() > ASIDE, distance > STEP, distance < ARRIVAL_DISTANCE)

@@ -162,8 +162,8 @@ FAULTS = {
     ],
     "envs/base.py": [
         (
-            "reward[diverged], terminated[diverged] = 0.0, True",
-            "reward[diverged] = 0.0",
+            "            terminated[diverged] = True\n",
+            "",
             "envs/test_base.py envs/test_pd_character.py",
         ),
         ('["elapsed_steps"] >= self', '["elapsed_steps"] > self', "envs/test_base.py"),

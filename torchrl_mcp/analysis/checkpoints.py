@@ -140,7 +140,8 @@ def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
     Returns:
         Trajectories by a title with stage and directions, which marks runs that are still training.
     """
-    cfg, panels = policies.policy_config(path), {}
+    cfg = policies.policy_config(path)
+    panels = {}
     over = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):

@@ -27,7 +27,8 @@ class Feet:
     """
 
     def __init__(self, env: PDCharacterEnv) -> None:
-        model, feet = env.simulation.model, env.character.feet
+        model = env.simulation.model
+        feet = env.character.feet
         bodies = body_names(env.character.name)
         others = tuple(body for body in bodies if body not in feet)
         self._geoms, self._half_sizes, self._radii = falling_geoms(model, others, len(bodies))

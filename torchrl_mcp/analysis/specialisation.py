@@ -41,7 +41,8 @@ def explained_by_phase(values: Array, phases: Array, num_bins: int = PHASE_BINS)
     """
     deviation = values - values.mean(0)
     predicted = bin_means(deviation, phases, num_bins)[(phases * num_bins).astype(int)]
-    explained, total = np.square(predicted).sum(0), np.square(deviation).sum(0)
+    explained = np.square(predicted).sum(0)
+    total = np.square(deviation).sum(0)
     return _ratio(explained, total), float(_ratio(explained.sum(), total.sum()))
 
 
@@ -75,7 +76,8 @@ def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
         standing: Whether the right and the left foot stand, shape ``(M, 2)``.
     """
     side = standing[:, 1].astype(float) - standing[:, 0]
-    side, values = side - side.mean(), values - values.mean(0)
+    side = side - side.mean()
+    values = values - values.mean(0)
     norms = np.sqrt(np.square(side).sum() * np.square(values).sum(0))
     return _ratio(side @ values, norms)
 
@@ -91,7 +93,8 @@ def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
     """
     centred = actions - actions.mean(0)
     _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
-    scores, shares = centred @ directions[:num].T, _ratio(np.square(sizes[:num]), np.square(sizes).sum())
+    scores = centred @ directions[:num].T
+    shares = _ratio(np.square(sizes[:num]), np.square(sizes).sum())
     missing = num - len(shares)
     return np.pad(scores, ((0, 0), (0, missing))), np.pad(shares, (0, missing))
 

@@ -49,10 +49,12 @@ def draw_walk_cycle(walk: Walk, untrained: Mapping[str, float], *, title: str) -
 
 def _draw_weights(figure: SubFigure, walk: Walk) -> None:
     num_primitives = walk.gates.shape[-1]
-    rows, cells = -(-num_primitives // 2), cycle_rows(walk)
+    rows = -(-num_primitives // 2)
+    cells = cycle_rows(walk)
     alone = [row for row in cells if row["primitive"] == 1 and row["right_foot"] > 0.5 >= row["left_foot"]]
     grid = figure.subplots(rows + 1, 2, sharex=True, squeeze=False, height_ratios=[1.0] * rows + [0.55])
-    palette, stance = colours(num_primitives), stance_correlation(walk.gates, walk.standing)
+    palette = colours(num_primitives)
+    stance = stance_correlation(walk.gates, walk.standing)
     for number, (axes, colour) in enumerate(zip(grid[:-1].T.flat, palette, strict=False), start=1):
         own = [row for row in cells if row["primitive"] == number]
         phase, mean, low, high = (np.array([row[key] for row in own]) for key in ("phase", "mean", "low", "high"))

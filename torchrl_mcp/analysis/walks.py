@@ -73,7 +73,9 @@ def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float 
     clips = torch.zeros(env.num_envs, dtype=torch.int64)
     env.reset()
     state = env.reset(env.get_state().update(TensorDict(env.beginning(clips, moments), env.batch_size)), set_state=True)
-    feet, running, steps = Feet(env), torch.ones(env.num_envs, dtype=torch.bool), []
+    feet = Feet(env)
+    running = torch.ones(env.num_envs, dtype=torch.bool)
+    steps = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(round(seconds / env.control_timestep)):
             decision = policy(state.select("observation", "goal"))

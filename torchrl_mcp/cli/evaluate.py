@@ -51,7 +51,9 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
             + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
         if reach := numbers.get("reach"):
-            share, standing, ideal = round(100 * reach["place"]), reach["standing"], reach["ideal"]
+            share = round(100 * reach["place"])
+            standing = reach["standing"]
+            ideal = reach["ideal"]
             print(f"    {share}% of the way from standing still ({standing:.3f}) to an ideal player ({ideal:.3f})")
         if diagnostics := numbers["diagnostics"]:
             print(text_table([{"diagnostic": name, "value": value} for name, value in diagnostics.items()]))

@@ -132,7 +132,9 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 
 def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
     """Return the modules that a command line trusts, and the command line without them."""
-    trusted, others, rest = [], [], iter(words)
+    trusted = []
+    others = []
+    rest = iter(words)
     for word in rest:
         if word == "--trust":
             trusted.append(own_module(next(rest, "")))

@@ -49,7 +49,8 @@ def parse(words: list[str]) -> argparse.Namespace:
     """Return the arguments; for an untrained ``agent``, ``checkpoint`` is None and ``settings`` configure it."""
     options = parser()
     arguments = options.parse_args(words)
-    arguments.settings, arguments.checkpoint = arguments.checkpoint, None
+    arguments.settings = arguments.checkpoint
+    arguments.checkpoint = None
     if arguments.agent is None:
         if len(arguments.settings) != 1:
             options.error(f"give one CHECKPOINT, not {len(arguments.settings)}; or --agent, and task=... character=...")

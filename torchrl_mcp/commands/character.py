@@ -68,7 +68,8 @@ def adapt(arguments: argparse.Namespace) -> int:
         ValueError: If MuJoCo cannot read the file or what was made of it, a file to write is there already, or the name
             is of another character or module.
     """
-    name, folder = arguments.name, arguments.output
+    name = arguments.name
+    folder = arguments.output
     source = _spec(
         mujoco.MjSpec.from_file, str(arguments.file), arguments.file, arguments.floating, arguments.root
     ).compile()

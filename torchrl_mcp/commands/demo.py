@@ -178,7 +178,8 @@ def learn(runs: Sequence[DictConfig]) -> None:
 
 def show_progress(processes: Sequence[BaseProcess], runs: Runs) -> None:
     """Show one line of progress of all runs until they are trained, then until they are evaluated."""
-    total, done = sum(map(_steps, runs.values())), sum(progress(cfg)[0] for cfg in runs.values())
+    total = sum(map(_steps, runs.values()))
+    done = sum(progress(cfg)[0] for cfg in runs.values())
     moments = ticks(processes, interval=1.0)
     with TrainingBar(total, done, estimate=False) as line:
         for _ in moments:
@@ -197,7 +198,8 @@ def progress(cfg: DictConfig) -> tuple[int, float | None]:
     rows = read_metrics(Path(cfg.run_dir))
     if not rows:
         return 0, None
-    task, training = cfg.task[cfg.stage.name], cfg.training
+    task = cfg.task[cfg.stage.name]
+    training = cfg.training
     full = training.num_envs * task.get("max_episode_steps", cfg.task.evaluation.max_episode_steps)
     recent = [row[NORMALISED_RETURN] for row in rows[-RECENT:] if row["frames"] > full]
     ended = [value for value in recent if math.isfinite(value)]
@@ -263,7 +265,8 @@ def film(folder: Path, runs: Runs) -> bool:
 
     No episode ends, so that the arrow, which is drawn from one seed, stays the same for both.
     """
-    path, seconds = folder / FILM, runs["mcp"].demo.seconds
+    path = folder / FILM
+    seconds = runs["mcp"].demo.seconds
     if path.exists():
         return True
     players = {}

@@ -80,7 +80,9 @@ def _explored(arguments: argparse.Namespace) -> tuple[dict[str, Exploration], st
     if others := {cfg.character.name for _, cfg, _ in runs} - {first.character.name}:
         given = f"{first.character.name} and {', '.join(others)}"
         raise ValueError(f"checkpoints are of {given}: give those of one character")
-    num, seed, std = arguments.trajectories, arguments.seed, first.get("action_std", first.character.action_std)
+    num = arguments.trajectories
+    seed = arguments.seed
+    std = first.get("action_std", first.character.action_std)
     env, start = checkpoints.ground(first, num, seconds=arguments.seconds, seed=seed)
     panels: dict[str, Exploration] = {}
     for name, cfg, agent in runs:

@@ -39,7 +39,8 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
-    steps, trust = run_folder.frames(checkpoint.find(run)), trust_options(run / CONFIG)
+    steps = run_folder.frames(checkpoint.find(run))
+    trust = trust_options(run / CONFIG)
     card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits, trust=trust), encoding="utf-8")
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
 
@@ -90,7 +91,8 @@ Limits:
 
 def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -> str:
     """Return how a policy was trained, as a list."""
-    preset, machine = origin.get("choices", {}).get("preset", "unknown"), origin.get("machine", {})
+    preset = origin.get("choices", {}).get("preset", "unknown")
+    machine = origin.get("machine", {})
     facts = (
         f"{_contents(path, cfg)}; {path.stat().st_size / 1e6:.1f} MB in bfloat16",
         f"{steps:,} steps, preset {preset}, seed {cfg.seed}, {machine.get('processor', 'unknown machine')}",

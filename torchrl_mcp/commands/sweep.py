@@ -42,7 +42,8 @@ class Sweep(Callback):
             log = "".join([f"{line}\n", *traceback.format_exception(error)])
             (self.folder / f"{config.hydra.job.num}.log").write_text(log, encoding="utf-8")
             print(f"failed: {line}", file=sys.stderr, flush=True)
-        job_return.status, job_return.return_value = JobStatus.COMPLETED, None
+        job_return.status = JobStatus.COMPLETED
+        job_return.return_value = None
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """List the failed runs.

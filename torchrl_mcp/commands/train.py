@@ -130,11 +130,13 @@ def _resume(cfg: DictConfig) -> Path:
     """Continue the run in ``cfg.resume`` with the few settings that a run can change."""
     from torchrl_mcp.runs import experiment, records
 
-    folder, given = Path(cfg.resume), HydraConfig.get().overrides.task
+    folder = Path(cfg.resume)
+    given = HydraConfig.get().overrides.task
     overrides = OverridesParser.create().parse_overrides(list(given))
     values: dict[str, Any] = {override.key_or_group: override.value() for override in overrides}
     del values["resume"]
-    device, total_frames = values.pop("device", None), values.pop("training.total_frames", None)
+    device = values.pop("device", None)
+    total_frames = values.pop("training.total_frames", None)
     files = places.outside(read_config(folder / CONFIG)) if (folder / CONFIG).is_file() else {}
     moves = {name: str(value) for name, value in values.items() if name in files}
     if ignored := [str(override.input_line) for override in overrides if override.key_or_group in {*values} - {*moves}]:

@@ -79,7 +79,8 @@ def follow_each(
     Raises:
         ValueError: If the reference may change, or the clips do not divide the environments.
     """
-    library, count = env.library, len(env.library)
+    library = env.library
+    count = len(env.library)
     if env.switch_probability or env.clip_end != "truncate":
         raise ValueError(
             "the reference changes within an episode: make the environment with switch_interval=inf and "

@@ -147,7 +147,8 @@ def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, froz
         sampler("latents", IndependentNormal, loc=ENCODING[0], scale=ENCODING[1]),
     )
     decoder = TensorDictModule(parts["decoder"], in_keys=[STATE, "latents"], out_keys=["action", "_"])
-    policy, trained = TensorDictSequential(*encoder, decoder), ProbabilisticTensorDictSequential(*encoder)
+    policy = TensorDictSequential(*encoder, decoder)
+    trained = ProbabilisticTensorDictSequential(*encoder)
     return Actor(policy, trained, stored=("latents",), sampled="latents")
 
 

@@ -134,7 +134,8 @@ def option_critic_actor(
     )
     arriving: tuple[TensorDictModule, ...] = ()
     if "terminations" not in frozen:
-        normaliser, state = parts["observation_normaliser"], ("normalised", "arrival")
+        normaliser = parts["observation_normaliser"]
+        state = ("normalised", "arrival")
         arriving = (
             TensorDictModule(normaliser, in_keys=[ARRIVAL], out_keys=[state]),
             TensorDictModule(parts["terminations"], in_keys=[state], out_keys=["terminations"]),

@@ -103,7 +103,8 @@ class WhereBeginning(nn.Module):
 
     def __init__(self, scores: nn.Module, num_options: int) -> None:
         super().__init__()
-        self.scores, self.num_options = scores, num_options
+        self.scores = scores
+        self.num_options = num_options
 
     def forward(self, observation: Tensor, goal: Tensor, begins: Tensor) -> Tensor:
         """Return scores ``(*B, K)``."""
@@ -132,9 +133,13 @@ class RandomSequence:
         num_options: int,
         steps: int,
     ) -> None:
-        self._options, self._num, self._generator = options, num, generator
-        self._num_options, self._steps = num_options, steps
-        self._elapsed, self._option = 0, torch.zeros(num, dtype=torch.int64, device=generator.device)
+        self._options = options
+        self._num = num
+        self._generator = generator
+        self._num_options = num_options
+        self._steps = steps
+        self._elapsed = 0
+        self._option = torch.zeros(num, dtype=torch.int64, device=generator.device)
 
     def __call__(self, state: Tensor) -> Tensor:
         """Return the actions of the next step, ``(N, A)``, from states ``(N, S)``."""

@@ -86,7 +86,9 @@ class GatesInARow(TensorDictModuleBase):
         _require_same(acts)
         if crossfade < 0:
             raise ValueError(f"crossfade={crossfade} is negative: pass seconds")
-        self.env, self.acts, self.activation = env, tuple(acts), gate_activation
+        self.env = env
+        self.acts = tuple(acts)
+        self.activation = gate_activation
         self.composite = DeterministicAction(distribution_class)
         self.rate = min(1.0, env.control_timestep / crossfade) if crossfade else 1.0
         self.act = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)

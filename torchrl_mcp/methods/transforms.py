@@ -79,10 +79,12 @@ class OptionMemory(Transform):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the state of :meth:`get_extra_state`."""
-        self._held, self._restored = {key: value.clone() for key, value in state.items()}, True
+        self._held = {key: value.clone() for key, value in state.items()}
+        self._restored = True
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        held, steps = tensordict["held_option"], tensordict["held_steps"]
+        held = tensordict["held_option"]
+        steps = tensordict["held_steps"]
         begins = tensordict.get("begins", torch.zeros_like(steps, dtype=torch.bool))
         option = tensordict.get("option", held)
         self._held = {"held_option": option.clone(), "held_steps": steps.masked_fill(begins, 0) + 1}

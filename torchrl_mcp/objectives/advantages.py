@@ -46,7 +46,8 @@ class Advantages:
     out_keys = ("advantage", "value_target")
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
-        self.critic, self.clip = critic, clip
+        self.critic = critic
+        self.clip = clip
         self.gae = ScaledGAE(gamma, lmbda)
 
     @torch.no_grad()

@@ -90,14 +90,17 @@ class OptionAdvantages:
         epsilon: float,
         termination_cost: float,
     ) -> None:
-        self.critic, self.clip = critic, clip
-        self.epsilon, self.termination_cost = epsilon, termination_cost
+        self.critic = critic
+        self.clip = clip
+        self.epsilon = epsilon
+        self.termination_cost = termination_cost
         self.gae = ScaledGAE(gamma, lmbda)
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Add the estimates, each ``(*B, T, 1)``, to trajectories of shape ``(*B, T)``."""
-        option, here = batch["option"], self._criticised(batch)
+        option = batch["option"]
+        here = self._criticised(batch)
         values, terminations = upon_arrival(here, batch, self._criticised).chunk(2, dim=-1)
         kept = of_option(values, option)
         chosen = (EpsilonGreedy(values, self.epsilon).probs * values).sum(-1, keepdim=True)

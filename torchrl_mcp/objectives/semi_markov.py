@@ -54,7 +54,10 @@ class SemiMarkovAdvantages:
     out_keys = ("advantage", "value_target")
 
     def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
-        self.critic, self.gamma, self.lmbda, self.clip = critic, gamma, lmbda, clip
+        self.critic = critic
+        self.gamma = gamma
+        self.lmbda = lmbda
+        self.clip = clip
         self.reward_scale = reward_scale(gamma)
 
     @torch.no_grad()
@@ -81,7 +84,8 @@ class SemiMarkovAdvantages:
 
     def _targets(self, batch: TensorDictBase, value: Tensor) -> Tensor:
         r"""TD(:math:`\lambda`) returns from every step, given the values where choices begin, ``(*B, T, 1)`` each."""
-        terminated, done = batch["next", "terminated"], batch["next", "done"].clone()
+        terminated = batch["next", "terminated"]
+        done = batch["next", "done"].clone()
         done[..., -1, :] = True
         next_value = upon_arrival(value, batch, self._values).masked_fill(terminated, 0.0)
         lmbda = self.lmbda * (~done).to(value.dtype)

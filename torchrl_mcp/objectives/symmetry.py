@@ -57,7 +57,10 @@ class MirroredSamples:
         self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module], *, tolerance: float = 20.0
     ) -> None:
         _require_actions(actor)
-        self.advantages, self.actor, self.mirrors, self.tolerance = advantages, actor, mirrors, tolerance
+        self.advantages = advantages
+        self.actor = actor
+        self.mirrors = mirrors
+        self.tolerance = tolerance
         self.out_keys = advantages.out_keys
 
     @torch.no_grad()

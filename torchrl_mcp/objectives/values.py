@@ -31,7 +31,8 @@ class ValueLoss(nn.Module):
 
     def __init__(self, critic_network: TensorDictModuleBase, *, coeff: float) -> None:
         super().__init__()
-        self.critic_network, self.coeff = critic_network, coeff
+        self.critic_network = critic_network
+        self.coeff = coeff
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_critic`` of samples ``(B,)``, and the ``explained_variance`` of the targets as a share.
@@ -39,7 +40,8 @@ class ValueLoss(nn.Module):
         Raises:
             ValueError: If ``value_target`` has another shape than the values, ``(B, 1)``.
         """
-        target, values = tensordict["value_target"], self._values(tensordict)
+        target = tensordict["value_target"]
+        values = self._values(tensordict)
         if target.shape != values.shape:
             shapes = f"shape {tuple(target.shape)}, but values have {tuple(values.shape)}"
             raise ValueError(f"value_target has {shapes}: give both the same shape, for example by unsqueeze(-1)")

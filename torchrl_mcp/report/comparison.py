@@ -109,7 +109,9 @@ def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
     others = _independent(varying([_learned(run) for run in runs]), runs)
     groups = []
     for alike in grouped(runs, lambda run: _frozen(_learned(run), others)).values():
-        first, named, learned = alike[0], choices(alike[0]), _learned(alike[0])
+        first = alike[0]
+        named = choices(alike[0])
+        learned = _learned(alike[0])
         settings = {name: named[name] for name in telling if named[name] is not None}
         settings |= {name: learned.get(name, DEFAULT) for name in others}
         by_seed = sorted(alike, key=lambda run: run.seed)

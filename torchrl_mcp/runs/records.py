@@ -176,7 +176,8 @@ def require_same_run(cfg: DictConfig, path: Path) -> None:
 def elsewhere(folder: Path, cfg: DictConfig) -> str:
     """Return a message if a run that is to be resumed began on another machine, empty if it did not."""
     precision = name(choose(cfg.autocast, cfg.device).autocast)
-    began, now = _origin(folder).get("machine", {}), machine(cfg.device)
+    began = _origin(folder).get("machine", {})
+    now = machine(cfg.device)
     if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
         return ""
     return (

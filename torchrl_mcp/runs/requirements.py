@@ -60,7 +60,8 @@ def require_environment(cfg: DictConfig) -> None:
     Raises:
         ValueError: If there is none, or this version lacks a class that the configuration names.
     """
-    task, character = cfg.task.name, cfg.character.name
+    task = cfg.task.name
+    character = cfg.character.name
     if module := cfg.character.get("module"):
         import_own(module, f"character={character} is in the module")
     if cfg.stage.name not in cfg.task:

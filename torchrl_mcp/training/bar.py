@@ -43,7 +43,10 @@ class TrainingBar:
         self, total: int, done: int = 0, *, shown: bool = True, estimate: bool = True, file: TextIO | None = None
     ) -> None:
         self._file = file or sys.stderr
-        self._total, self._done, self._first, self._shown = total, done, done, shown
+        self._total = total
+        self._done = done
+        self._first = done
+        self._shown = shown
         self._began = self._told = time.monotonic()
         self._note = ""
         self._second: tuple[float, int] | None = None  # time and steps at the beginning of the second batch

@@ -118,7 +118,8 @@ def load_agent(parts: nn.ModuleDict, path: Path, optional: Collection[str] = ("c
     Raises:
         ValueError: As :func:`load`.
     """
-    components, missing = _manifest(path)["components"], {*optional, *shared(path)}
+    components = _manifest(path)["components"]
+    missing = {*optional, *shared(path)}
     load_parts(parts, [name for name in parts if name not in missing or _component(name) in components], path)
 
 

@@ -97,7 +97,8 @@ class LocalSource:
 
     def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
         """Set up TorchRL's collector."""
-        device, self._stopwatch = batches.device, batches.stopwatch
+        device = batches.device
+        self._stopwatch = batches.stopwatch
         self._precision = partial(torch.autocast, device.type, torch.bfloat16, enabled=batches.autocast)
         self._stopwatch.watch("forward", policy)
         random = GlobalRNGState().state_dict()
@@ -191,14 +192,18 @@ class RemoteSource:
         if backend == "ray" and find_spec("ray") is None:
             raise ValueError("collector=ray needs Ray: pip install 'torchrl-mcp[ray]'")
         self.env = make_env(num_envs=1, seed=seed)
-        self.num_envs, self.num_workers, self.seed = num_envs, num_workers, seed
+        self.num_envs = num_envs
+        self.num_workers = num_workers
+        self.seed = seed
         self._make_env = partial(_begin_worker, make_env, num_envs=num_envs // num_workers, num_threads=num_threads)
         self._backend = {"backend": backend, "backend_options": dict(backend_options or {})}
         self._starts = 0
 
     def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
         """Start the workers."""
-        self._stopwatch, self._device, self._steps = batches.stopwatch, batches.device, batches.frames // self.num_envs
+        self._stopwatch = batches.stopwatch
+        self._device = batches.device
+        self._steps = batches.frames // self.num_envs
         seeds = np.random.SeedSequence((self.seed, self._starts)).generate_state(self.num_workers)
         self._starts += 1
         random = GlobalRNGState().state_dict()
@@ -277,8 +282,10 @@ class _Autocast(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase, device: torch.device) -> None:
         super().__init__()
-        self.policy, self.device_type = policy, device.type
-        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        self.policy = policy
+        self.device_type = device.type
+        self.in_keys = policy.in_keys
+        self.out_keys = policy.out_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Act."""

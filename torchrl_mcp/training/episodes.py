@@ -30,7 +30,8 @@ class EpisodeStatistics:
         """Add trajectories ``(N, T)``; return the return and length of each of the ``E`` ended episodes, ``(E,)``."""
         ended_returns, ended_lengths = [], []
         self.steps += batch.shape[1]
-        rewards, dones = task_reward(batch["next"]).squeeze(-1).cpu(), batch["next", "done"].squeeze(-1).cpu()
+        rewards = task_reward(batch["next"]).squeeze(-1).cpu()
+        dones = batch["next", "done"].squeeze(-1).cpu()
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
             self.returns += reward
             self.lengths += 1
@@ -47,4 +48,5 @@ class EpisodeStatistics:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`; older ones lack the steps."""
         self.steps = state.get("steps", math.inf)
-        self.returns, self.lengths = state["returns"].clone(), state["lengths"].clone()
+        self.returns = state["returns"].clone()
+        self.lengths = state["lengths"].clone()

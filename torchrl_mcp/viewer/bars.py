@@ -18,7 +18,9 @@ def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> Non
         weights: Weights of primitives 1, 2, ..., from 0 to 1.
         title: Title of the bars.
     """
-    draw, row, length = ImageDraw.Draw(picture), round(picture.height * ROW), round(picture.height * LENGTH)
+    draw = ImageDraw.Draw(picture)
+    row = round(picture.height * ROW)
+    length = round(picture.height * LENGTH)
     font = ImageFont.load_default(0.8 * row)
     left, top, gap = 2 * row, 2 * row, max(1, row // 6)
     plate = (row // 2, row // 3, left + length + row // 2, top + len(weights) * row + row // 3)

@@ -52,8 +52,10 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
     if not player.simulated:
         yield from own_pictures(player, seconds=seconds, width=width, height=height, every=every)
         return
-    timestep, model = player.env.control_timestep, softly_lit(player.env.simulation.model)
-    camera, distance = Camera(model, width=width, height=height), DISTANCE * player.extent
+    timestep = player.env.control_timestep
+    model = softly_lit(player.env.simulation.model)
+    camera = Camera(model, width=width, height=height)
+    distance = DISTANCE * player.extent
     camera.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
     camera.view.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
@@ -146,7 +148,8 @@ def save_films(players: Mapping[str, Player], path: Path, *, seconds: float, wid
         ValueError: If an argument is out of range, or as :func:`~torchrl_mcp.evaluation.formats.require_format`.
     """
     require_format(path)
-    save, every = {".gif": save_gif, ".mp4": save_mp4}[path.suffix], EVERY[path.suffix]
+    save = {".gif": save_gif, ".mp4": save_mp4}[path.suffix]
+    every = EVERY[path.suffix]
     timestep = next(iter(players.values())).env.control_timestep
     interval = every * timestep
     if round(seconds / timestep) < every:
@@ -164,7 +167,8 @@ def _beside(pictures: Sequence[Image.Image], titles: Sequence[str]) -> Image.Ima
     """Return pictures of one size in a row, each with its title at the bottom."""
     width, height = pictures[0].size
     row = Image.new("RGB", (len(pictures) * width, height))
-    draw, font = ImageDraw.Draw(row), ImageFont.load_default(height / 14)
+    draw = ImageDraw.Draw(row)
+    font = ImageFont.load_default(height / 14)
     for column, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
         row.paste(picture, (column * width, 0))
         draw.text(((column + 0.5) * width, 0.97 * height), title, fill=INK, font=font, anchor="mb")

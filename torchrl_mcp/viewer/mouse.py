@@ -45,11 +45,16 @@ class Mouse:
 
     def _press(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
         """Start dragging the body under the mouse if it can move, or store the point on the ground."""
-        model, data, perturb, picked = viewer.model, viewer.data, viewer.perturb, _pick(viewer, io)
+        model = viewer.model
+        data = viewer.data
+        perturb = viewer.perturb
+        picked = _pick(viewer, io)
         if picked.body == 0:
             self._pressed = io.MousePos.x, io.MousePos.y, np.array(picked.point)
         elif picked.body > 0 and model.body_weldid[picked.body] > 0:
-            perturb.select, perturb.flexselect, perturb.skinselect = picked.body, -1, -1
+            perturb.select = picked.body
+            perturb.flexselect = -1
+            perturb.skinselect = -1
             arm = np.array(picked.point) - data.xpos[picked.body]
             perturb.localpos = data.xmat[picked.body].reshape(3, 3).T @ arm
             ux.InitPerturb(model, data, viewer.camera, perturb, int(mujoco.mjtPertBit.mjPERT_TRANSLATE))
@@ -58,7 +63,8 @@ class Mouse:
     def _drag(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
         """Drag the body in the vertical plane, or with Shift the horizontal plane, until the button is released."""
         if not imgui.IsMouseDown(imgui.MouseButton.Left):
-            viewer.perturb.active, self._dragging = 0, False
+            viewer.perturb.active = 0
+            self._dragging = False
             return
         plane = mujoco.mjtMouse.mjMOUSE_MOVE_H if io.KeyShift else mujoco.mjtMouse.mjMOUSE_MOVE_V
         way = io.MouseDelta.x / io.DisplaySize.x, io.MouseDelta.y / io.DisplaySize.y

@@ -61,9 +61,12 @@ class Player:
         self.simulated = hasattr(self.env, "simulation")
         self.extent = extent(self.env.simulation.model) if self.simulated else 1.0
         self.pinned: dict[int, float] = {}
-        self._policy, self._transformed, self._num_options = policy, env, num_options
+        self._policy = policy
+        self._transformed = env
+        self._num_options = num_options
         self._exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-        self._aside, self._before_step = aside * self.extent, before_step
+        self._aside = aside * self.extent
+        self._before_step = before_step
         self.reset()
 
     def reset(self) -> None:

@@ -60,8 +60,13 @@ class Recorder:
     ) -> None:
         if interval < 1:
             raise ValueError(f"recorder.interval={interval} must be at least 1, or null for no recordings")
-        self._folder, self._policy, self._make_env, self._loggers = folder, policy, make_env, loggers
-        self._num_options, self._interval, self._seconds = num_options, interval, seconds
+        self._folder = folder
+        self._policy = policy
+        self._make_env = make_env
+        self._loggers = loggers
+        self._num_options = num_options
+        self._interval = interval
+        self._seconds = seconds
         self._width, self._height = width, height
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:

@@ -55,8 +55,11 @@ def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour 
     """
     model = copy.copy(model)
     light = model.vis.headlight
-    light.ambient, light.diffuse, light.specular = [0.38] * 3, [0.35] * 3, [0.05] * 3
-    model.light_diffuse[:], model.light_specular[:] = 0.55, 0.1
+    light.ambient = [0.38] * 3
+    light.diffuse = [0.35] * 3
+    light.specular = [0.05] * 3
+    model.light_diffuse[:] = 0.55
+    model.light_specular[:] = 0.1
     model.vis.rgba.fog = HAZE
     model.vis.map.fogstart, model.vis.map.fogend = np.array([5.0, 15.0]) / model.stat.extent
     model.vis.map.shadowclip = 35.0 / model.stat.extent  # beyond the shadow map the ground is speckled
@@ -94,7 +97,8 @@ def extent(model: mujoco.MjModel) -> float:
 
 def _extend(model: mujoco.MjModel, plane: int) -> None:
     """Make a plane infinite with the same pattern: on large finite planes, MuJoCo draws haze as if they were far."""
-    size, material = model.geom_size[plane, :2], model.geom_matid[plane]
+    size = model.geom_size[plane, :2]
+    material = model.geom_matid[plane]
     if material >= 0 and (size > 0).all() and not model.mat_texuniform[material]:
         model.mat_texrepeat[material] /= size
         model.mat_texuniform[material] = True

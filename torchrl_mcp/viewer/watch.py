@@ -25,7 +25,9 @@ class Watch:
 
     def __init__(self, run: Path, parts: nn.ModuleDict, *, interval: float = 1.0) -> None:
         self.frames = -1
-        self._run, self._parts, self._interval = run, parts, interval
+        self._run = run
+        self._parts = parts
+        self._interval = interval
         self._next_look = 0.0
         self._seen: set[tuple[str, int, int]] = set()
 

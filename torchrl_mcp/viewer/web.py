@@ -68,14 +68,16 @@ class StudioApp(App):
     def __init__(self, steering: Steering, *, distance: float) -> None:
         self.shapes: list[Shape] = []
         self.weights: Weights | None = None
-        self._steering, self._distance = steering, distance
+        self._steering = steering
+        self._distance = distance
         self._mouse = Mouse(lambda place: self._send(lambda steering: steering.put(place)))
         super().__init__(Config(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
         """Follow the first body below the world, once there is one."""
         camera = self.viewer.camera
-        camera.trackbodyid, camera.distance = 1, self._distance
+        camera.trackbodyid = 1
+        camera.distance = self._distance
         camera.azimuth, camera.elevation = AZIMUTH, ELEVATION
         following = ux.TRACKING_CAMERA_IDX if self.model.nbody > 1 else ux.FREE_CAMERA_IDX
         self.ux_state.camera_index = ux.set_camera(self.model, camera, following)
@@ -123,7 +125,8 @@ class Pace(plugin.SimPlugin):
     @messages.handler
     def on_step_control(self, snapshot: messages.StepControlSnapshot) -> None:
         """Copy the viewer's settings."""
-        self.paused, self.speed = snapshot.pause_state != sim.PauseState.UNPAUSED, snapshot.speed / 100
+        self.paused = snapshot.pause_state != sim.PauseState.UNPAUSED
+        self.speed = snapshot.speed / 100
 
 
 class BrowserInput(plugin.SimPlugin):
@@ -161,7 +164,8 @@ def play_in_browser(player: Player, *, port: int) -> None:
         player: The player to show.
         port: Port of the page, 0 for the first free one from 8080.
     """
-    steering, pace = Steering(player), Pace()
+    steering = Steering(player)
+    pace = Pace()
     app = StudioApp(steering, distance=FURTHER * DISTANCE * player.extent)
     model = softly_lit(player.env.simulation.model, horizon=HORIZON, zenith=ZENITH)
     data = mujoco.MjData(model)
@@ -172,7 +176,8 @@ def play_in_browser(player: Player, *, port: int) -> None:
             if not pace.paused:
                 steering.step()
             mujoco.mj_copyData(data, model, player.data)
-            app.shapes, app.weights = player.shapes, player.weights or app.weights
+            app.shapes = player.shapes
+            app.weights = player.weights or app.weights
             viewer.sync(model, data)
             steering.push(data.xfrc_applied)  # of a dragged body
             time.sleep(max(0.0, due - time.perf_counter()))

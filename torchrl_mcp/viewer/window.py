@@ -37,7 +37,8 @@ class Keyboard:
     """
 
     def __init__(self, steering: Steering) -> None:
-        self.paused, self.speed = False, 1.0
+        self.paused = False
+        self.speed = 1.0
         self._pressed: SimpleQueue[int] = SimpleQueue()
         self._commands: dict[int, Callable[[], None]] = {
             263: lambda: steering.turn(TURN),  # GLFW's left arrow
@@ -83,14 +84,18 @@ def play_in_window(player: Player) -> None:
     """
     require_display()
     steering = Steering(player)
-    keyboard, model = Keyboard(steering), softly_lit(player.env.simulation.model)
+    keyboard = Keyboard(steering)
+    model = softly_lit(player.env.simulation.model)
     data = mujoco.MjData(model)
     with mujoco.viewer.launch_passive(
         model, data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
     ) as viewer:
         camera = viewer.cam
-        camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1
-        camera.distance, camera.azimuth, camera.elevation = DISTANCE * player.extent, AZIMUTH, ELEVATION
+        camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+        camera.trackbodyid = 1
+        camera.distance = DISTANCE * player.extent
+        camera.azimuth = AZIMUTH
+        camera.elevation = ELEVATION
         while viewer.is_running():
             due = time.perf_counter() + player.env.control_timestep / keyboard.speed
             keyboard.execute()

@@ -39,16 +39,19 @@ def read_asf_amc(path: str | Path, *, asf: str | Path | None = None, fps: float 
     """
     file = TextFile.read(path)
     skeleton = read_asf(_beside(file) if asf is None else asf)
-    names, leaves = list(skeleton.bones), [name for name in skeleton.bones if name not in skeleton.parents.values()]
+    names = list(skeleton.bones)
+    leaves = [name for name in skeleton.bones if name not in skeleton.parents.values()]
     channels, lines = _motion(file, skeleton, len(names) + len(leaves))
     begins = [skeleton.position, *(skeleton.bones[parent].tip for parent in skeleton.parents.values())]
     offsets = torch.stack([*begins, *(skeleton.bones[name].tip for name in leaves)])
-    translations, rotations = offsets.repeat(len(lines), 1, 1), identities(len(lines), len(offsets))
+    translations = offsets.repeat(len(lines), 1, 1)
+    rotations = identities(len(lines), len(offsets))
     columns = iter(channels.unbind(-1))
     for index, bone in enumerate(skeleton.bones.values()):
         turned = identities(len(lines))
         for key in bone.dof:
-            value, which = next(columns), "xyz".index(key[1])
+            value = next(columns)
+            which = "xyz".index(key[1])
             if key in TRANSLATIONS:
                 translations[:, index, which] = value
             else:
@@ -78,7 +81,9 @@ def _beside(file: TextFile) -> Path:
 
 def _motion(file: TextFile, skeleton: AsfSkeleton, joints: int) -> tuple[Tensor, Sequence[int]]:
     """Read the channels of all bones in their order, angles in radians, ``(T, C)``, and the lines of the frames."""
-    values, lines, mentioned = array("d"), array("q"), {"root"}
+    values = array("d")
+    lines = array("q")
+    mentioned = {"root"}
     for line, frame in _frames(file, skeleton):
         mentioned = set(frame) if not lines else mentioned
         if "root" not in frame or set(frame) != mentioned:
@@ -98,7 +103,8 @@ def _motion(file: TextFile, skeleton: AsfSkeleton, joints: int) -> tuple[Tensor,
 
 def _frames(file: TextFile, skeleton: AsfSkeleton) -> Iterator[tuple[int, Mapping[str, Sequence[float]]]]:
     """Read frame by frame: its line, and the channels of the bones that it mentions."""
-    start, expected = 0, 0.0
+    start = 0
+    expected = 0.0
     frame: dict[str, Sequence[float]] = {}
     for line, (name, *words) in file.statements(comment="#"):
         if name.startswith(":"):
@@ -109,7 +115,9 @@ def _frames(file: TextFile, skeleton: AsfSkeleton) -> Iterator[tuple[int, Mappin
             [number] = file.numbers([name], line)
             if start and number != expected:
                 raise file.error(f"here is frame {number:g} and should be {expected:g}: correct it", line)
-            start, frame, expected = line, {}, number + 1
+            start = line
+            frame = {}
+            expected = number + 1
         elif not start:
             raise file.error(f"{shortened(name)} stands before the first frame: pass an AMC file", line)
         elif name not in skeleton.bones or name in frame:

@@ -66,7 +66,8 @@ def find_joints(
             found on the root.
         ValueError: If the map has an unknown part.
     """
-    given, known = joint_map or {}, (*TRUNK, *LEGS, *HEAD_AND_ARMS)
+    given = joint_map or {}
+    known = (*TRUNK, *LEGS, *HEAD_AND_ARMS)
     if wrong := sorted(given.keys() - set(known)):
         raise ValueError(f"joint_map has {', '.join(wrong)}: the parts of the body are {', '.join(known)}")
     if absent := [name for name in given.values() if name not in source.names]:

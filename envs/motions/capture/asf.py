@@ -85,7 +85,8 @@ def read_asf(path: str | Path) -> AsfSkeleton:
 
 def _units(file: TextFile, section: Sequence[Statement]) -> tuple[float, bool]:
     """Read metres per unit of length, and whether angles are in degrees."""
-    unit, degrees = INCH, True
+    unit = INCH
+    degrees = True
     for statement in section:
         match [word.lower() for word in statement.words]:
             case ["length", *_]:
@@ -104,7 +105,9 @@ def _units(file: TextFile, section: Sequence[Statement]) -> tuple[float, bool]:
 
 def _root(file: TextFile, section: Sequence[Statement], degrees: bool) -> tuple[Tensor, Bone]:
     """Read the position, axes and channels of the root."""
-    position, angles, order = [0.0] * 3, [0.0] * 3, "xyz"
+    position = [0.0] * 3
+    angles = [0.0] * 3
+    order = "xyz"
     dof: list[str] = []
     for statement in section:
         match statement.words[0].lower():
@@ -132,7 +135,8 @@ def _bones(file: TextFile, section: Sequence[Statement], degrees: bool) -> dict[
                 name, bone = _bone(file, block, statement.line, degrees)
                 if name in bones or name == "root":
                     raise file.error(f"a second bone {shortened(name)}: rename it", statement.line)
-                bones[name], block = bone, {}
+                bones[name] = bone
+                block = {}
             case keyword:
                 block[keyword] = statement
     if block:
@@ -150,7 +154,8 @@ def _bone(file: TextFile, block: Mapping[str, Statement], line: int, degrees: bo
     norm = float(torch.linalg.vector_norm(direction))
     if not 0.5 < norm < 2.0:
         raise file.error(f"the direction has length {norm:g}: give a unit vector", block["direction"].line)
-    angles, order = [0.0] * 3, "xyz"
+    angles = [0.0] * 3
+    order = "xyz"
     if "axis" in block:
         statement = block["axis"]
         angles = file.vector(Statement(statement.line, statement.words[:4]))

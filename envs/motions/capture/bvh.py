@@ -102,7 +102,8 @@ def _hierarchy(file: TextFile, statements: Iterator[Statement]) -> list[_Joint]:
 
 def _declared(file: TextFile, statement: Statement, joints: Sequence[_Joint], opened: Sequence[int]) -> _Joint:
     """Read ``ROOT name``, ``JOINT name`` or ``End Site``."""
-    keyword, name = statement.words[0].upper(), " ".join(statement.words[1:])
+    keyword = statement.words[0].upper()
+    name = " ".join(statement.words[1:])
     if not name:
         raise file.error(f"{keyword} without a name: add one", statement.line)
     if (keyword == "ROOT") == bool(joints):
@@ -132,10 +133,12 @@ def _motion(
     file: TextFile, statements: Iterator[Statement], joints: Sequence[_Joint], fps: float | None
 ) -> tuple[float, Tensor, Sequence[int]]:
     """Read the part after ``MOTION``: frames per second, channels, shape ``(T, C)``, and the lines of the frames."""
-    frames, time = _header(file, statements, "Frames"), _header(file, statements, "Frame Time")
+    frames = _header(file, statements, "Frames")
+    time = _header(file, statements, "Frame Time")
     rate = frame_rate(fps, _stated_rate(file, time) if fps is None else 1.0)
     width = sum(len(joint.channels) for joint in joints)
-    values, lines = array("d"), array("q")
+    values = array("d")
+    lines = array("q")
     for line, words in statements:
         if len(words) != width:
             raise file.error(f"has {len(words)} numbers, and the skeleton has {width} channels: correct it", line)
@@ -172,11 +175,13 @@ def _stated_rate(file: TextFile, time: Statement) -> float:
 def _transforms(joints: Sequence[_Joint], values: Tensor) -> tuple[Tensor, Tensor]:
     """Convert channels to translations and rotations, shapes ``(T, J, 3)`` and ``(T, J, 4)``."""
     offsets = torch.tensor([joint.offset for joint in joints], dtype=torch.float64)
-    translations, rotations = offsets.repeat(len(values), 1, 1), identities(len(values), len(joints))
+    translations = offsets.repeat(len(values), 1, 1)
+    rotations = identities(len(values), len(joints))
     columns = iter(values.unbind(-1))
     for index, joint in enumerate(joints):
         for axis, kind in joint.channels:
-            value, which = next(columns), "xyz".index(axis)
+            value = next(columns)
+            which = "xyz".index(axis)
             if kind == "position":
                 translations[:, index, which] = value
             else:

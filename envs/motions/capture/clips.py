@@ -23,7 +23,8 @@ def as_source(clip: MotionClip, path: str | Path) -> SourceMotion:
     rest = body_states(clip.character, torch.from_numpy(model.qpos0)[None], torch.zeros(1, model.nv).double())
     turns = multiply(states.orientations, inverse(rest.orientations).expand_as(states.orientations))
     parents = torch.from_numpy(model.body_parentid[1:]).long() - 1
-    others, carriers = slice(1, None), parents[1:]
+    others = slice(1, None)
+    carriers = parents[1:]
     back = inverse(turns[:, carriers])
     arms = rotate(back, states.positions[:, others] - states.positions[:, carriers])
     return SourceMotion(

@@ -75,7 +75,8 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
         raise file.error(f"is not JSON of a motion: {error}", 1) from error
     if not isinstance(content, dict) or not isinstance(content.get("Frames"), list) or len(content["Frames"]) < 2:
         raise file.error('has no list of two or more "Frames": pass a motion of DeepMimic or DeepLoco', 1)
-    frames, loop = content["Frames"], content.get("Loop", "none")
+    frames = content["Frames"]
+    loop = content.get("Loop", "none")
     if not isinstance(loop, bool) and loop not in ("wrap", "none"):
         raise file.error(f'"Loop" is {shortened(str(loop))}: correct it to "wrap" or "none"', 1)
     width = len(frames[0]) if isinstance(frames[0], list) else 0

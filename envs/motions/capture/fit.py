@@ -134,7 +134,8 @@ def fit_clip(
     parts = key_map(clip.character, joint_map)
     followers = {} if character in HUMANS else key_map(character, bodies)
     followers = {part: body for part, body in followers.items() if part in parts}
-    source, loop = as_source(clip, path), clip.loop and not skip
+    source = as_source(clip, path)
+    loop = clip.loop and not skip
     return _retargeted(source, character, rate, kind, followers, loop=loop, joint_map=parts, skip=skip, scale=1.0)
 
 

@@ -61,7 +61,8 @@ def solved(body: Recording, character: str, bodies: Mapping[str, str]) -> tuple[
     Raises:
         ImportError: If mink is not installed.
     """
-    model, mink = character_model(character), _mink()
+    model = character_model(character)
+    mink = _mink()
     positions, turns = _targets(body, model, bodies)
     tasks = {}
     for part in bodies:
@@ -108,7 +109,8 @@ def _legs(body: Recording, rest: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Positions of root and legs, ``(T, 3)``, from positions in the rest pose, ``(3,)``."""
     middle = (rest["right_hip"] + rest["left_hip"]) / 2
     sole = (rest["right_ankle"][2] + rest["left_ankle"][2]) / 2
-    scale, floor = float(middle[2] - sole) / body.leg_length(), _floor(body)
+    scale = float(middle[2] - sole) / body.leg_length()
+    floor = _floor(body)
 
     def scaled(positions: Tensor) -> Tensor:
         height = _height(body, positions) - floor
@@ -151,7 +153,8 @@ def _floor(body: Recording) -> Tensor:
     """Height of standing ankles in metres, over the slope of the laboratory."""
     heights = []
     for ankle in ANKLES:
-        height, standing = _height(body, body.positions[ankle]), stands(body, ankle)
+        height = _height(body, body.positions[ankle])
+        standing = stands(body, ankle)
         heights.append(height[standing] if standing.any() else height.min().unsqueeze(0))
     return torch.cat(heights).median()
 
@@ -170,7 +173,8 @@ def _solve(
     posture.set_target(model.qpos0)
     limits = [mink.ConfigurationLimit(model)]
     start = configuration.q.copy()
-    start[:2], start[3:7] = poses["root"][0, 4:6], poses["root"][0, :4]
+    start[:2] = poses["root"][0, 4:6]
+    start[3:7] = poses["root"][0, :4]
     configuration.update(start)
     frames = len(poses["root"])
     qpos = np.empty((frames, model.nq))
@@ -198,7 +202,8 @@ def _values(model: mujoco.MjModel, qpos: Tensor, joint: int) -> Tensor:
 def _misses(model: mujoco.MjModel, qpos: Tensor, targets: Mapping[str, Tensor], bodies: Mapping[str, str]) -> Tensor:
     """Greatest angle in radians between the bones of a state and of its targets, ``(T,)``."""
     ids = {part: model.body(name).id for part, name in bodies.items()}
-    data, reached = mujoco.MjData(model), np.empty((len(qpos), model.nbody, 3))
+    data = mujoco.MjData(model)
+    reached = np.empty((len(qpos), model.nbody, 3))
     for frame, data.qpos in enumerate(qpos.numpy()):
         mujoco.mj_kinematics(model, data)
         reached[frame] = data.xpos

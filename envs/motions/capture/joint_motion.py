@@ -106,7 +106,8 @@ def require_frames(duration: float, rate: float) -> None:
 
 def closed(motion: JointMotion) -> JointMotion:
     """Make a motion a cycle: heights, tilts of the root and joints end as they began; path and heading are kept."""
-    path, root = motion.path.clone(), motion.joints["root"]
+    path = motion.path.clone()
+    root = motion.joints["root"]
     path[:, 2] = closed_values(path[:, 2])
     headings = about_z(heading(root))
     joints = {name: closed_values(values) for name, values in motion.joints.items() if name != "root"}
@@ -127,14 +128,16 @@ def states(character: str, motion: JointMotion) -> tuple[Tensor, Tensor]:
     """States in MuJoCo's order with joints within their limits, ``(T, nq)``, and the angles cut from each, ``(T,)``."""
     model = character_model(character)
     qpos = torch.from_numpy(model.qpos0).repeat(len(motion.path), 1)
-    qpos[:, :3], qpos[:, 3:7] = motion.path, motion.joints["root"]
+    qpos[:, :3] = motion.path
+    qpos[:, 3:7] = motion.joints["root"]
     cut = torch.zeros(len(qpos), dtype=torch.float64)
     for index in range(1, model.njnt):
         joint = model.joint(index)
         name = "chest" if joint.name == "torso" and "chest" in motion.joints else joint.name
         if name not in motion.joints:
             continue
-        values, place = motion.joints[name], joint.qposadr[0]
+        values = motion.joints[name]
+        place = joint.qposadr[0]
         low, high = joint.range if model.jnt_limited[index] else (-math.inf, math.inf)
         if joint.type[0] == mujoco.mjtJoint.mjJNT_BALL:
             qpos[:, place : place + 4], excess = _within(values, high)

@@ -34,7 +34,8 @@ def key_map(character: str, given: Mapping[str, str] | None = None) -> dict[str,
     Raises:
         ValueError: If the map has an unknown part or body, or no body is known for a part of the legs.
     """
-    model, given = character_model(character), dict(given or {})
+    model = character_model(character)
+    given = dict(given or {})
     bodies = [model.body(index).name for index in range(1, model.nbody)]
     if wrong := sorted(given.keys() - set(PARTS)):
         raise ValueError(f"the map of bodies has {', '.join(wrong)}: the parts are {', '.join(PARTS)}")
@@ -104,7 +105,8 @@ def _has(name: str, word: str, outer: Sequence[str]) -> bool:
 
 def _feet(character: str) -> dict[str, str]:
     """The feet of a character with one on each side."""
-    sides, feet = CHARACTERS[character].sides, CHARACTERS[character].feet
+    sides = CHARACTERS[character].sides
+    feet = CHARACTERS[character].feet
     nearest = {}
     for index, side in enumerate(SIDES):
         affixes = tuple(pair[index] for pair in sides)

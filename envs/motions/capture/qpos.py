@@ -63,7 +63,8 @@ def read_qpos(
     source = TextFile.read(path) if Path(path).suffix.lower() == ".csv" else Archive(path)
     values, names, rate = _table(source) if isinstance(source, TextFile) else _arrays(source)
     if names and isinstance(source, TextFile):
-        quaternion, names = _root_order(source, names[:ROOT], quaternion), names[ROOT:]
+        quaternion = _root_order(source, names[:ROOT], quaternion)
+        names = names[ROOT:]
     rate = frame_rate(fps, rate)
     if rate is None:
         raise source.error("has no frame rate: give it (--fps)")
@@ -73,7 +74,9 @@ def read_qpos(
             f"hour, of a root position, a root quaternion and joints"
         )
     columns = _columns(source, model, joints or names, values.shape[1] - ROOT)
-    position, root, rest = values[:, :3], values[:, 3:ROOT], values[:, ROOT:]
+    position = values[:, :3]
+    root = values[:, 3:ROOT]
+    rest = values[:, ROOT:]
     order = [(quaternion or _order(source, model, root)).index(component) for component in "wxyz"]
     motion = {"root": _rotations(source, root[:, order], "root")}
     for name, found in columns.items():

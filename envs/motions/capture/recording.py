@@ -83,7 +83,8 @@ def record(
 ) -> Recording:
     """Find the parts of a body in a motion; see :func:`~torchrl_mcp.envs.motions.capture.retarget.retarget`."""
     joints = find_joints(source, parts, joint_map)
-    whole, source = source, source.without_first(skip)
+    whole = source
+    source = source.without_first(skip)
     _require_end(source)
     pose = source.poses()
     taken = rest_frame is None and stands_better(whole, joints, whole.rest)
@@ -91,7 +92,8 @@ def record(
     rest = whole.rest if rest_frame is None else whole.pose(rest_frame)
     rest, axes, assumed = upright(source, joints, rest, pose, up=up, rest_frame=rest_frame, skip=skip)
     metres = _metres_per_unit(source, {part: pose.positions[:, joint] for part, joint in joints.items()}, scale)
-    positions, standing = metres * pose.positions @ axes.mT, metres * rest.positions @ axes.mT
+    positions = metres * pose.positions @ axes.mT
+    standing = metres * rest.positions @ axes.mT
     turns = multiply(pose.rotations, inverse(rest.rotations).expand_as(pose.rotations))
     turns = torch.cat([turns[..., :1], turns[..., 1:] @ axes.mT], dim=-1)
     recording = Recording(

@@ -61,13 +61,16 @@ def retarget(
     has_arms = character == "humanoid"
     parts = (*TRUNK, *LEGS, *(HEAD_AND_ARMS if has_arms else ()))
     body = record(source, parts, scale=scale, up=up, joint_map=joint_map, skip=skip, rest_frame=rest_frame)
-    root, chest = body.turns["root"], body.turns["chest"]
+    root = body.turns["root"]
+    chest = body.turns["chest"]
     motion = {"root": root, "chest": _relative(root, chest)}
     for side in SIDES:
         hip, knee, ankle = limb(side, LEG)
         thigh, motion[knee] = _hinged(body, limb(side, LEG), forward=-1.0)
-        shank, foot = multiply(thigh, _flexed(motion[knee])), flat(body, ankle)
-        motion[hip], motion[ankle] = _relative(root, thigh), _relative(shank, foot)
+        shank = multiply(thigh, _flexed(motion[knee]))
+        foot = flat(body, ankle)
+        motion[hip] = _relative(root, thigh)
+        motion[ankle] = _relative(shank, foot)
         if has_arms:
             shoulder, elbow, _ = limb(side, ARM)
             upper_arm, motion[elbow] = _hinged(body, limb(side, ARM), forward=1.0)

@@ -129,7 +129,8 @@ def _forward_kinematics(parents: Sequence[int], translations: Tensor, rotations:
     positions: list[Tensor] = []
     turned: list[Tensor] = []
     for joint, parent in enumerate(parents):
-        shift, turn = translations[..., joint, :], rotations[..., joint, :]
+        shift = translations[..., joint, :]
+        turn = rotations[..., joint, :]
         if parent >= 0:
             shift = positions[parent] + rotate(turned[parent], shift)
             turn = multiply(turned[parent], turn)

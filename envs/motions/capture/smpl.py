@@ -74,7 +74,8 @@ def read_smpl(path: str | Path, *, body_model: str | Path | None = None, fps: fl
     names = list(SKELETON)
     parents = [names.index(parent) if parent else -1 for parent, _ in SKELETON.values()]
     archive = Archive(path)
-    vectors, root = _vectors(archive), archive.numbers("trans", 3)
+    vectors = _vectors(archive)
+    root = archive.numbers("trans", 3)
     if len(root) != len(vectors):
         raise archive.error(f"has {len(vectors)} poses and {len(root)} positions in trans: they should be equally many")
     _require_radians(archive, vectors)
@@ -102,7 +103,8 @@ def read_smpl(path: str | Path, *, body_model: str | Path | None = None, fps: fl
 def _vectors(archive: Archive) -> Tensor:
     """Rotation vectors of the joints, one after the other, shape ``(T, 66)``."""
     if "poses" not in archive.names:
-        root, body = archive.numbers("root_orient", 3), archive.numbers("pose_body", 63)
+        root = archive.numbers("root_orient", 3)
+        body = archive.numbers("pose_body", 63)
         if len(root) != len(body):
             raise archive.error(
                 f"has {len(root)} rotations in root_orient and {len(body)} in pose_body: they should be equally many"

@@ -17,7 +17,8 @@ VERTICALS = {
 }
 """Directions that can point up in a file, by name: ``"z"``, ``"-y"``, ..."""
 
-ROUGHLY, CLOSELY = math.cos(math.radians(60)), math.cos(math.radians(10))
+ROUGHLY = math.cos(math.radians(60))
+CLOSELY = math.cos(math.radians(10))
 """Cosines of the angles up to which legs and trunk point along an axis, and up to which they are meant to be on it."""
 
 UPRIGHT = math.radians(20)
@@ -116,7 +117,8 @@ def _middle(parts: Mapping[str, Tensor], joint: str) -> Tensor:
 
 def _directions(parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Unit vectors from the ankles to the hips and from there to the chest, shapes ``(*B, 3)``."""
-    legs, trunk = _middle(parts, "hip") - _middle(parts, "ankle"), parts["chest"] - _middle(parts, "hip")
+    legs = _middle(parts, "hip") - _middle(parts, "ankle")
+    trunk = parts["chest"] - _middle(parts, "hip")
     short = trunk.norm(dim=-1, keepdim=True) < SHORTEST_TRUNK * legs.norm(dim=-1, keepdim=True)
     return normalize(legs, dim=-1), normalize(torch.where(short, legs, trunk), dim=-1)
 

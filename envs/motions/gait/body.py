@@ -14,10 +14,12 @@ from torchrl_mcp.envs.motions.gait.feet import Sole
 from torchrl_mcp.envs.motions.gait.legs import Leg
 from torchrl_mcp.envs.rotations import about_x, about_y, about_z, inverse, multiply, rotate
 
-PELVIS_LEAN, TRUNK_LEAN = 0.1, 0.53
+PELVIS_LEAN = 0.1
+TRUNK_LEAN = 0.53
 """Lean into a turn, relative to :attr:`Course.lean`; the trunk's is measured."""
 
-SHOULDER_LEAD, HEAD_LEAD = 0.035, 0.1
+SHOULDER_LEAD = 0.035
+HEAD_LEAD = 0.1
 """Lead into a turn of more than 1 rad/s, in radians."""
 
 
@@ -59,8 +61,10 @@ def build_of(character: str) -> Build:
     rest = mujoco.MjData(model)
     mujoco.mj_forward(model, rest)
     trunk = "chest" if character == "humanoid" else "torso"
-    pelvis, upper = model.body("root"), model.body(trunk)
-    total, upper_mass = float(model.body_subtreemass[pelvis.id]), float(model.body_subtreemass[upper.id])
+    pelvis = model.body("root")
+    upper = model.body(trunk)
+    total = float(model.body_subtreemass[pelvis.id])
+    upper_mass = float(model.body_subtreemass[upper.id])
     foot = model.geom("left_ankle")
     return Build(
         trunk=trunk,
@@ -131,10 +135,8 @@ def head_and_arms(course: Course, activity: Tensor, trunk: Tensor) -> dict[str, 
         phase = course.phase - side.offset
         swing = 5 - activity * 9 * (1 + course.speed) * wave(phase, 0.03)
         flexion = 15 + 7 * course.speed - activity * (5 + 9 * course.speed) * wave(phase, 0.07)
-        outward, inward = (
-            about_x(torch.full_like(swing, 0.22 * side.sign)),
-            about_z(torch.full_like(swing, -0.25 * side.sign)),
-        )
+        outward = about_x(torch.full_like(swing, 0.22 * side.sign))
+        inward = about_z(torch.full_like(swing, -0.25 * side.sign))
         joints[f"{side.name}_shoulder"] = multiply(outward, multiply(about_y(-torch.deg2rad(swing)), inward))
         joints[f"{side.name}_elbow"] = torch.deg2rad(flexion).unsqueeze(-1)
     return joints

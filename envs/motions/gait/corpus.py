@@ -9,7 +9,8 @@ from torchrl_mcp.envs.motions.gait.generator import FPS, stride, walk
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.motions.smoothing import smoothed
 
-WALKS, DURATION = 7, 16.4
+WALKS = 7
+DURATION = 16.4
 """Number of walks and their seconds: 229.6 s with mirror images, as much as the paper's corpus."""
 
 TURN_RATE_QUANTILES = ((0.0, 0.0), (0.12, 0.14), (0.5, 0.52), (0.9, 1.36), (0.95, 1.6), (0.985, 3.1), (1.0, 3.2))
@@ -34,7 +35,8 @@ CHANGE = 3.0
 STOPS = ((1, 8.0), (4, 6.0))
 """Walks in which the character stands still, and the times in seconds."""
 
-STOP, HALT = 0.8, 2.0
+STOP = 0.8
+HALT = 2.0
 """Seconds of standing, and of slowing down before it and speeding up after it."""
 
 TURNING_SPEEDS = (("forward", 1.0, 0.0), ("slight", 1.05, 0.4), ("medium", 0.95, 0.8), ("sharp", 0.8, 1.4))

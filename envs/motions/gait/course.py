@@ -88,9 +88,11 @@ def plan(speed: Tensor, turn_rate: Tensor, fps: float, height: float, start: int
         start: Frame at the origin.
     """
     heading = accumulated(turn_rate, fps, start)
-    forward, left = unit_vector(heading), unit_vector(heading + torch.pi / 2)
+    forward = unit_vector(heading)
+    left = unit_vector(heading + torch.pi / 2)
     path = accumulated(speed.unsqueeze(-1) * forward, fps, start)
-    along, across = torch.gradient(speed, spacing=1 / fps)[0], speed * turn_rate
+    along = torch.gradient(speed, spacing=1 / fps)[0]
+    across = speed * turn_rate
     acceleration = along.unsqueeze(-1) * forward + across.unsqueeze(-1) * left
     balance = path - height / GRAVITY * acceleration
     return Course(fps, speed, turn_rate, heading, balance, accumulated(stride_rate(speed, turn_rate), fps, start))

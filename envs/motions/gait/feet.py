@@ -20,7 +20,9 @@ from torchrl_mcp.envs.motions.gait.curves import (
 from torchrl_mcp.envs.motions.keyframes import minimum_jerk
 from torchrl_mcp.envs.rotations import about_y, about_z, multiply, unit_vector
 
-STEP_WIDTH, CURVE_WIDTH, SPOT_WIDTH = 0.12, 0.10, 0.20
+STEP_WIDTH = 0.12
+CURVE_WIDTH = 0.10
+SPOT_WIDTH = 0.20
 """Distance between the ankles in metres: straight ahead, in a curve, and on the spot, where the legs could cross."""
 
 CURVED = 0.9
@@ -42,7 +44,8 @@ MEDIAL = 0.015
 """Distance in metres of that point towards the other foot."""
 
 
-LONG, SHORT = 0.4, 0.08
+LONG = 0.4
+SHORT = 0.08
 """Lengths of strides in metres: above the first, feet move as in normal walking; far below the second, they rest."""
 
 
@@ -90,11 +93,14 @@ def step(course: Course, side: Side, sole: Sole) -> Foot:
         sole: Sole of the foot.
     """
     phase = _warped((course.phase - side.offset - MID_STANCE) % 1 + MID_STANCE, course.speed)
-    last, following = course.moment(side, FOOTHOLD), course.moment(side, 1 + FOOTHOLD)
+    last = course.moment(side, FOOTHOLD)
+    following = course.moment(side, 1 + FOOTHOLD)
     start, start_heading = _foothold(course, side, last)
     end, end_heading = _foothold(course, side, following)
-    distance, turn = torch.linalg.vector_norm(end - start, dim=-1), end_heading - start_heading
-    vigour, stepping = settled(distance, LONG), settled(torch.hypot(distance, STEP_WIDTH * turn), SHORT)
+    distance = torch.linalg.vector_norm(end - start, dim=-1)
+    turn = end_heading - start_heading
+    vigour = settled(distance, LONG)
+    stepping = settled(torch.hypot(distance, STEP_WIDTH * turn), SHORT)
 
     position, heading = _foothold(course, side, last + spline(ADVANCE, phase) * (following - last))
     pitch = _rolling(course, side, phase) * torch.deg2rad(spline(FOOT_PITCH, phase))
@@ -142,7 +148,8 @@ def _rolling(course: Course, side: Side, phase: Tensor) -> Tensor:
 def _foothold(course: Course, side: Side, frames: Tensor) -> tuple[Tensor, Tensor]:
     """Position on the ground and heading of a flat foot beside the body in some frames."""
     heading = between_frames(course.heading, frames)
-    turn_rate, speed = between_frames(course.turn_rate, frames), between_frames(course.speed, frames)
+    turn_rate = between_frames(course.turn_rate, frames)
+    speed = between_frames(course.speed, frames)
     width = STEP_WIDTH + (CURVE_WIDTH - STEP_WIDTH) * settled(turn_rate, CURVED)
     width = width + (SPOT_WIDTH - width) * settled((turn_rate / (speed + CREEPING)) ** 2, TIGHT**2)
     beside = (side.sign * width / 2).unsqueeze(-1) * unit_vector(heading + torch.pi / 2)

@@ -20,12 +20,14 @@ WALKERS = ("humanoid", "biped")
 
 FPS = 60.0
 SLOWEST_FPS = 30.0
-FASTEST, SHARPEST = 1.6, 3.2
+FASTEST = 1.6
+SHARPEST = 3.2
 
 MARGIN = 4.0
 """Seconds walked before and after the clip, so that the ends of the course do not affect it."""
 
-AHEAD, STRIDE = 0.053, 0.82
+AHEAD = 0.053
+STRIDE = 0.82
 """Forward shift of the pelvis in long strides, and the scale of their length, in metres: pressure moves to the toes."""
 
 
@@ -92,7 +94,8 @@ def _states(character: str, speed: Tensor, turn_rate: Tensor, fps: float, start:
     course = plan(speed, turn_rate, fps, build.height, start)
     feet = {side: step(course, side, build.sole) for side in SIDES}
     activity = settled(torch.hypot(speed, 0.15 * turn_rate), 0.15)
-    pelvis, trunk = pelvis_orientation(course, activity), trunk_orientation(course, activity)
+    pelvis = pelvis_orientation(course, activity)
+    trunk = trunk_orientation(course, activity)
     position = (
         _balanced(course, feet, build.height)
         - build.overhang(pelvis, trunk)

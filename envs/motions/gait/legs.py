@@ -110,7 +110,8 @@ def leg_joints(leg: Leg, side: Side, pelvis: Tensor, root: Tensor, foot: Foot, f
     length = length.clamp_max(float(leg.length(torch.deg2rad(torch.tensor(1.0)))))
     hip = torch.acos((leg.thigh**2 + length**2 - leg.shank**2) / (2 * leg.thigh * length))
     ankle = torch.acos((leg.shank**2 + length**2 - leg.thigh**2) / (2 * leg.shank * length))
-    thigh, shank = multiply(limb, about_y(-hip)), multiply(limb, about_y(ankle))
+    thigh = multiply(limb, about_y(-hip))
+    shank = multiply(limb, about_y(ankle))
     return multiply(inverse(pelvis), thigh), hip + ankle, multiply(inverse(shank), foot.orientation)
 
 

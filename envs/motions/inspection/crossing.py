@@ -44,7 +44,8 @@ def legs_apart(character: str, qpos: Tensor) -> Tensor:
 
 def _leg_shapes(model: mujoco.MjModel, foot: int, other: int) -> list[int]:
     """Colliding shapes of the leg of a foot: all that hangs on the first body that does not carry another foot."""
-    trunk, leg = line_of(model, other), reversed(line_of(model, foot))
+    trunk = line_of(model, other)
+    leg = reversed(line_of(model, foot))
     bodies = {next(body for body in leg if body not in trunk)} if foot not in trunk else set()
     for body in range(model.nbody):
         if model.body_parentid[body] in bodies:

@@ -88,7 +88,8 @@ def feasibility(clip: MotionClip) -> Feasibility:
 
 def _limits(clip: MotionClip) -> tuple[float, str]:
     """Greatest violation of a joint's limits, which may be negative, and the joint; 0 without limits."""
-    model, layout = character_model(clip.character), joint_layout(clip.character)
+    model = character_model(clip.character)
+    layout = joint_layout(clip.character)
     worst = {}
     for joint in np.flatnonzero(model.jnt_limited).tolist():
         low, high = model.jnt_range[joint]
@@ -106,9 +107,11 @@ def _limits(clip: MotionClip) -> tuple[float, str]:
 def _dynamics(clip: MotionClip, points: list[Tensor], grounded: list[Tensor]) -> tuple[float, str, float]:
     """Greatest ratio of torque to the motor's limit, 0 without limits, its joint, and the imbalance."""
     wrench, inverse = _inverse_dynamics(clip)
-    force, moment = wrench[:, :3], wrench[:, 3:]
+    force = wrench[:, :3]
+    moment = wrench[:, 3:]
     pressure = np.stack([-moment[:, 1], moment[:, 0]], axis=-1) / np.maximum(force[:, 2:], 1e-6)
-    corners, down = torch.cat(points, dim=1)[..., :2], torch.cat(grounded, dim=1)
+    corners = torch.cat(points, dim=1)[..., :2]
+    down = torch.cat(grounded, dim=1)
     supported = down.any(-1)
     outside = _distance_outside(torch.from_numpy(pressure), corners, down)[supported]
     centres = [_centre(position, on) for position, on in zip(points, grounded, strict=True)]
@@ -127,9 +130,11 @@ def _inverse_dynamics(clip: MotionClip) -> tuple[np.ndarray, np.ndarray]:
     """Force and moment about the origin on the root, ``(T, 6)``, and all generalised forces, ``(T, nv)``."""
     model = character_model(clip.character)
     data = mujoco.MjData(model)
-    qpos, qvel = clip.qpos.numpy(), clip.qvel.numpy()
+    qpos = clip.qpos.numpy()
+    qvel = clip.qvel.numpy()
     qacc = np.gradient(qvel, 1 / clip.fps, axis=0)
-    wrench, inverse = np.empty((len(qpos), 6)), np.empty_like(qvel)
+    wrench = np.empty((len(qpos), 6))
+    inverse = np.empty_like(qvel)
     for frame, (data.qpos, data.qvel, data.qacc) in enumerate(zip(qpos, qvel, qacc, strict=True)):
         mujoco.mj_inverse(model, data)
         inverse[frame] = data.qfrc_inverse
@@ -148,11 +153,13 @@ def _motor_torques(
     feet = [model.body(name).id for name in CHARACTERS[clip.character].feet]
     dofs = model.jnt_dofadr[model.actuator_trnid[:, 0]] + np.abs(model.actuator_gear[:, :3]).argmax(-1)
     torques = inverse.copy()
-    linear, angular = np.empty((3, model.nv)), np.empty((3, model.nv))
+    linear = np.empty((3, model.nv))
+    angular = np.empty((3, model.nv))
     for frame, data.qpos in enumerate(clip.qpos.numpy()):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        force, moment = wrench[frame, :3], wrench[frame, 3:]
+        force = wrench[frame, :3]
+        moment = wrench[frame, 3:]
         about = sum(float(share) * centre[frame].numpy() for share, centre in zip(shares[frame], centres, strict=True))
         for foot, share, centre in zip(feet, shares[frame].tolist(), centres, strict=True):
             mujoco.mj_jac(model, data, linear, angular, centre[frame].numpy(), foot)
@@ -174,7 +181,8 @@ def _shares(pressure: Tensor, centres: list[Tensor], down: list[Tensor]) -> Tens
     if len(centres) != 2:
         on = torch.stack(down, dim=-1).double()
         return on / on.sum(-1, keepdim=True).clamp_min(1)
-    first, second = centres[0][:, :2], centres[1][:, :2]
+    first = centres[0][:, :2]
+    second = centres[1][:, :2]
     between = second - first
     part = ((pressure - first) * between).sum(-1) / between.square().sum(-1)
     part = torch.where(down[0] & down[1], part.clamp(0, 1), down[1].to(part.dtype))

@@ -37,7 +37,8 @@ def pictures(clip: MotionClip, times: Tensor, *, size: int, follow_heading: bool
     """
     model = _scene(clip.character)
     distance = 1.7 * character_model(clip.character).stat.extent
-    data, camera = mujoco.MjData(model), Camera(model, width=size, height=size)
+    data = mujoco.MjData(model)
+    camera = Camera(model, width=size, height=size)
     qpos = clip.at(times)
     azimuths = 90.0 + heading(qpos[:, 3:7]).rad2deg()
     camera.view.elevation = -10.0

@@ -102,7 +102,8 @@ def root_signals(clip: MotionClip, states: BodyStates, window: float) -> RootSig
 
 def leg_signals(clip: MotionClip, states: BodyStates, side: str, root: RootSignals) -> LegSignals:
     """Return the signals of the leg and the arm of a side, ``"right"`` or ``"left"``."""
-    names, model = body_names(clip.character), character_model(clip.character)
+    names = body_names(clip.character)
+    model = character_model(clip.character)
     forward, left = _axes(root.heading)
     foot = names.index(f"{side}_ankle")
     ankle = states.positions[:, foot, :2]

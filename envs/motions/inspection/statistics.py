@@ -132,7 +132,8 @@ def _prepared(clip: MotionClip) -> MotionClip:
 
 def _measured(stride: Stride, root: RootSignals, legs: dict[str, LegSignals], fps: float) -> list[float]:
     """All of :class:`GaitStatistics` for one stride, in order."""
-    leg, other = legs[stride.side], legs[stride.other]
+    leg = legs[stride.side]
+    other = legs[stride.other]
     frames = stride.end - stride.start
     both = (stride.other_toe_off - stride.start) + (stride.toe_off - stride.other_start)
     turned = root.heading[stride.end] - root.heading[stride.start]

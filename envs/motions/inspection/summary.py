@@ -74,7 +74,8 @@ def foot_slide(clip: MotionClip) -> float:
     to 1 m/s. Moments without a foot on the ground, as in jumps, rolls, cartwheels and crawls, and in which the body
     runs or spins, are left out.
     """
-    names, bodies = body_names(clip.character), body_states(clip.character, clip.qpos, clip.qvel)
+    names = body_names(clip.character)
+    bodies = body_states(clip.character, clip.qpos, clip.qvel)
     feet = [names.index(foot) for foot in CHARACTERS[clip.character].feet[:2]]
     if len(feet) < 2:
         return math.nan
