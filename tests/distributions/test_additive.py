@@ -6,7 +6,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 
-GRID = torch.linspace(-12, 12, 801, dtype=torch.float64)
+GRID = torch.linspace(-12, 12, 401, dtype=torch.float64)
 
 
 def random_primitives(*batch, num_primitives=3, action_dim=2, seed=0):
