@@ -72,12 +72,12 @@ def go_on(folder, stop):
     return SimpleNamespace(folder=folder, half=half, output=output.getvalue())
 
 
-def learn_here(task, runs):
-    """Do here what goes on from a checkpoint, in place of a process, whose imports take seconds."""
-    if not Path(runs[0].run_dir).exists():
-        return start(task, runs)
-    task(runs)
-    return start(int)
+def work_here(task, argument):
+    """Do here what goes on from a checkpoint, and the page, in place of processes, whose imports take seconds."""
+    if task is demo.learn and not Path(argument[0].run_dir).exists():
+        return start(task, argument)
+    task(argument)
+    return SimpleNamespace(is_alive=lambda: False, join=lambda timeout=None: None, exitcode=0)
 
 
 def require_continued(demonstration):
@@ -96,7 +96,7 @@ def next_commands(demonstration):
 def finished(tmp_path_factory):
     """A demonstration that was interrupted in the middle and called again."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "start", learn_here)
+        patch.setattr(demo, "start", work_here)
         return go_on(tmp_path_factory.mktemp("runs") / "my demo", interrupt)
 
 

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from torchrl_mcp import __version__, analysis
 from torchrl_mcp.commands import export
 from torchrl_mcp.commands.demo_page import write_page
-from torchrl_mcp.runs import configuration, experiment, processes, records
+from torchrl_mcp.runs import configuration, experiment, records
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.runs.processes import start, ticks
 from torchrl_mcp.runs.tables import text_table
@@ -77,7 +77,7 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
     print(introduction(runs, folder), flush=True)
     cores = [[cfg for name, cfg in runs.items() if name != "scratch"], [runs["scratch"]]]
     show_progress([start(learn, core) for core in cores], runs)
-    page_writer = processes.start(page, folder)  # on the other core, beside the film
+    page_writer = start(page, folder)  # on the other core, beside the film
     rows = results(runs)
     print("\n" + report(folder, runs, rows))
     made = {FILM: film(folder, runs)}
