@@ -52,6 +52,7 @@ FAULTS = {
     "torchrl_mcp/distributions/primitives.py": [
         ("(gates >= 0)", "(gates > 0)", "distributions/test_validation.py"),
         ("(scale > 0)", "(scale >= 0)", "distributions/test_validation.py"),
+        ("negative = gates < 0", "negative = gates < -1", "distributions/test_validation.py"),
         ("if gates.shape[-1] != shape[-2]", "if False", "distributions/test_validation.py"),
     ],
     "torchrl_mcp/modules/gating.py": [
@@ -76,7 +77,9 @@ FAULTS = {
     ],
     # Methods
     "torchrl_mcp/methods/mcp.py": [
-        ("networks.rescale(initial_std / comp", "networks.rescale(1.0 / comp", "methods/test_composite.py"),
+        ("rescale(initial_std / comp", "rescale(1.0 / comp", "methods/test_composite.py"),
+        ("if loc.shape[-1] != sizes.action", "if False", "methods/test_composite.py"),
+        ("for name, use in needs.items()", "for name, use in ()", "methods/test_composite.py"),
         ('stored=("gates", *PRIMITIVES)', 'stored=("gates",)', "methods/test_composite.py methods/test_contract.py"),
         ('    require_frozen("primitives", frozen, over="weights")\n', "", "methods/test_exploration_over_weights.py"),
     ],
