@@ -37,8 +37,9 @@ LONGER = "runs/test_places.py::test_a_longer_run_goes_on_from_another_folder_aft
 FAULTS = {
     # Distributions and networks
     "torchrl_mcp/distributions/multiplicative.py": [
-        ("(weights / total * loc).sum(-2)", "(weights / total * loc).mean(-2)", "distributions/test_multiplicative.py"),
-        ("weights = gates * (log", "weights = (log", "distributions/test_multiplicative.py"),
+        ("(precisions * loc).sum(-2)", "(precisions * loc).mean(-2)", "distributions/test_multiplicative.py"),
+        ("gates.unsqueeze(-1) * scale", "scale", "distributions/test_multiplicative.py"),
+        (".clamp_min(MIN_SCALE)", "", "distributions/test_multiplicative.py"),
     ],
     "torchrl_mcp/distributions/additive.py": [
         ("(gates * function(actions)).sum(0)", "function(actions).mean(0)", "distributions/test_additive.py"),
