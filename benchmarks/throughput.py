@@ -2,6 +2,7 @@
 
     python benchmarks/throughput.py            # about five minutes, writes results/throughput_env.csv
     python benchmarks/throughput.py --quick    # about one, writes nothing unless given --output
+    python benchmarks/throughput.py --distributions    # half a minute, writes results/throughput_distributions.csv
 
 Every contender simulates Ant-v5 (5 physics steps per action, without contact observations and costs unless stated),
 acts at random and resets fallen ants. Each has its own process. In a turn they are measured one after the other, round
@@ -11,6 +12,10 @@ rounds' ratios. Compare only speeds of the same turn.
 Environments with a process each are measured with one process, with one per processor, and Gymnasium's with 64; a loop
 in Python does not get faster with more. EnvPool is measured if it is installed; ``--envpool-python`` sets an
 interpreter with EnvPool.
+
+With ``--distributions``, each contender draws actions with their log-probabilities instead, on one thread: 256 states,
+8 primitives and 28 actions, from given primitives and gates. Their clock is the processor's time. ``--before`` sets
+another clone, whose product is measured beside.
 """
 
 import argparse
@@ -32,6 +37,7 @@ import numpy as np
 from report import about, peak_memory, table, write
 
 RESULTS = Path(__file__).parent / "results" / "throughput_env.csv"
+DISTRIBUTIONS = RESULTS.with_name("throughput_distributions.csv")
 SUBSTEPS = 5
 HEALTHY_Z = (0.2, 1.0)
 ANT = {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0}
@@ -146,32 +152,74 @@ CONTENDERS: dict[str, tuple[Callable[[int], Step], tuple[int, ...]]] = {
 """Constructor of each contender, and its number of environments in each turn."""
 
 
+def drawing(num_states: int, distribution: str, *, compiled: bool = False) -> Step:
+    """Draw an action with its log-probability in each state."""
+    import torch
+    from torchrl.modules import IndependentNormal
+
+    from torchrl_mcp import distributions
+
+    torch.set_num_threads(1)
+    loc = torch.randn(num_states, 8, 28)
+    scale, gates = torch.rand_like(loc) + 0.1, torch.rand(num_states, 8)
+    single = distribution == "IndependentNormal"
+    parameters = (loc[:, 0].contiguous(), scale[:, 0].contiguous()) if single else (loc, scale, gates)
+    make = IndependentNormal if single else getattr(distributions, distribution)
+
+    @torch.no_grad()
+    def draw(*parameters: torch.Tensor) -> torch.Tensor:
+        policy = make(*parameters)
+        return policy.log_prob(policy.sample())
+
+    function = torch.compile(draw, fullgraph=True) if compiled else draw
+    return lambda index: function(*parameters)
+
+
+BEFORE = "MultiplicativeGaussian, before"
+DRAWING = {
+    "IndependentNormal": partial(drawing, distribution="IndependentNormal"),
+    "MultiplicativeGaussian": partial(drawing, distribution="MultiplicativeGaussian"),
+    BEFORE: partial(drawing, distribution="MultiplicativeGaussian"),
+    "AdditiveGaussian": partial(drawing, distribution="AdditiveGaussian"),
+    "IndependentNormal, compiled": partial(drawing, distribution="IndependentNormal", compiled=True),
+    "MultiplicativeGaussian, compiled": partial(drawing, distribution="MultiplicativeGaussian", compiled=True),
+    "AdditiveGaussian, compiled": partial(drawing, distribution="AdditiveGaussian", compiled=True),
+}
+"""Constructors of what draws actions."""
+
+
 def worker(name: str, num_envs: int) -> None:
     """Set a contender up, then time it for the seconds in each line of standard input."""
-    step, index = CONTENDERS[name][0](num_envs), 0
+    step, index = {**{name: make for name, (make, _) in CONTENDERS.items()}, **DRAWING}[name](num_envs), 0
     until = time.perf_counter() + 0.3  # warm up, and let the first ants fall
     while index < 20 or time.perf_counter() < until:
         step(index)
         index += 1
     print(json.dumps({"ready": True}), flush=True)
+    clock = time.process_time if name in DRAWING else time.perf_counter
     for line in sys.stdin:
-        start, first = time.perf_counter(), index
-        while time.perf_counter() - start < float(line):
+        start, first = clock(), index
+        while clock() - start < float(line):
             step(index)
             index += 1
-        speed = (index - first) * num_envs / (time.perf_counter() - start)
+        speed = (index - first) * num_envs / (clock() - start)
         print(json.dumps({"speed": speed, "memory": peak_memory(os.getpid())}), flush=True)
     os._exit(0)  # closing tens of environments in order takes longer than measuring them
 
 
-def measure(sizes: dict[str, int], envpool_python: str, rounds: int, seconds: float) -> Iterator[dict[str, Any]]:
+def measure(
+    sizes: dict[str, int], envpool_python: str, rounds: int, seconds: float, before: Path | None = None
+) -> Iterator[dict[str, Any]]:
     """Measure contenders in turns, each with its number of environments."""
     processes = {}
     for name, num_envs in sizes.items():
         python = envpool_python if name == "EnvPool" else sys.executable
         command = [python, __file__, "--worker", name, str(num_envs)]
         pipe = subprocess.PIPE
-        processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
+        variables = {**os.environ, "PYTHONPATH": str(before)} if name == BEFORE else None
+        processes[name] = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, env=variables
+        )
     rows = {
         name: {"contender": name, "num_envs": sizes[name], "speeds": []}
         for name, process in processes.items()
@@ -227,16 +275,40 @@ def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def measure_distributions(before: Path | None, output: Path) -> None:
+    """Measure, print and write the time of an action with its log-probability in 256 states."""
+    facts, num_states = about(), 256
+    sizes = {name: num_states for name in DRAWING if name != BEFORE or before}
+    rows = list(measure(sizes, sys.executable, rounds=15, seconds=0.15, before=before))
+    normal = next(row for row in rows if row["contender"] == "IndependentNormal")
+    lines = [
+        {
+            "contender": row["contender"],
+            "microseconds": round(1e6 * num_states / median(row["speeds"])),
+            "best": round(1e6 * num_states / max(row["speeds"])),
+            "of_normal": round(1 / ratio(row, normal), 2),
+        }
+        for row in rows
+    ]
+    print(table(lines))
+    write(output, [{**line, "rounds": 15, **facts} for line in lines])
+
+
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="sizes 64 and 256, fewer rounds")
     parser.add_argument("--envpool-python", default=sys.executable, help="interpreter that has EnvPool")
+    parser.add_argument("--distributions", action="store_true", help="measure distributions instead")
+    parser.add_argument("--before", type=Path, metavar="CLONE", help="another clone, for --distributions")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--worker", nargs=2, metavar=("NAME", "NUM_ENVS"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
         worker(args.worker[0], int(args.worker[1]))
+    if args.distributions:
+        measure_distributions(args.before, args.output or DISTRIBUTIONS)
+        return
 
     rounds, seconds = (3, 0.7) if args.quick else (5, 1.0)
     facts, rows = about(), []

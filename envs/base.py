@@ -196,6 +196,8 @@ class CharacterEnv(EnvBase):
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
 
+        A task without a goal returns none, and emits one of shape ``(N, 0)``.
+
         Args:
             ids: The simulations, as indices ``(n,)`` or the slice of all.
 
@@ -364,10 +366,11 @@ class CharacterEnv(EnvBase):
         one = (self.num_envs, 1)
         bounds = self._action_bounds().to(self.device, self._dtype)
         low, high = bounds.expand(self.num_envs, -1, -1).unbind(-1)
-        seen = self._observed_of(ALL)
+        seen = {**self._observed_of(ALL)}
         name = f"{type(self).__name__}.observe()"
-        if missing := [key for key in ("observation", "goal") if key not in seen]:
-            raise ValueError(f"{name} lacks {missing[0]}: return it, with shape ({self.num_envs}, 0) if it is empty")
+        if "observation" not in seen:
+            raise ValueError(f"{name} lacks observation: return it, with shape ({self.num_envs}, numbers)")
+        seen.setdefault("goal", torch.zeros(self.num_envs, 0, device=self.device))
         if wrong := [key for key, value in seen.items() if value.ndim != 2 or len(value) != self.num_envs]:
             raise ValueError(
                 f"{wrong[0]} of {name} has shape {tuple(seen[wrong[0]].shape)}: return ({self.num_envs}, numbers)"

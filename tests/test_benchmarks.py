@@ -240,3 +240,14 @@ def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primiti
         env_alone = Heading("biped", 3, seed=0, max_episode_steps=5)
         expected = env_alone.step(env_alone.reset(before, set_state=True).set("action", action))
         torch.testing.assert_close(step["next", "reward"], expected["next", "reward"])
+
+
+def test_every_distribution_draws_an_action_with_its_log_probability_in_each_state():
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        contenders = runpy.run_path(str(BENCHMARKS / "throughput.py"))["DRAWING"]
+    for name, make in contenders.items():
+        if "compiled" not in name:
+            assert make(4)(0).shape == (4,)
+    torch.set_num_threads(threads)

@@ -128,6 +128,16 @@ def test_a_closed_primitive_however_narrow_leaves_the_others_as_they_are(scale):
         assert loc.grad.isfinite().all()
 
 
+def test_an_open_primitive_is_at_least_as_wide_as_documented_and_has_finite_gradients():
+    loc, scale = torch.tensor([[3.0], [1.0]]), torch.tensor([[1e-38], [2.0]], requires_grad=True)
+    gates = torch.tensor([0.25, 1.0], requires_grad=True)
+    policy = MultiplicativeGaussian(loc, scale, gates)
+    assert (policy.mean.item(), policy.stddev.item()) == pytest.approx((3.0, 2e-12))
+    policy.log_prob(torch.tensor([3.0])).backward()
+    assert scale.grad.isfinite().all()
+    assert gates.grad.isfinite().all()
+
+
 def test_the_floor_on_the_precision_is_reached_without_a_jump():
     loc, scale = torch.full((1, 1), 3.0, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
     above, below = (MultiplicativeGaussian(loc, scale, torch.tensor([1e-8 * r])) for r in (1.001, 0.999))

@@ -161,7 +161,7 @@ def test_it_compiles_into_one_graph(distribution_class, backend, random_primitiv
     torch.testing.assert_close(*gradients)
 
 
-@pytest.mark.parametrize("validate_args", [True, False])
+@pytest.mark.parametrize("validate_args", [True, False, None])
 def test_it_works_under_vmap_and_functional_grad(distribution_class, validate_args, random_primitives):
     *primitives, action = *random_primitives(5), torch.zeros(5, 2, dtype=torch.float64)
 

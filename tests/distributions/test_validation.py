@@ -96,7 +96,13 @@ def test_validation_follows_torch_s_default_unless_told(distribution_class, defa
     if default:
         refused(lambda: distribution_class(**bad), "gates")
     else:
-        distribution_class(**bad)
+        distribution_class(**GOOD | {"scale": -torch.ones(3, 2)})
+
+
+def test_raw_logits_are_refused_with_the_remedy_where_validation_is_off_by_default(distribution_class, monkeypatch):
+    monkeypatch.setattr(Distribution, "_validate_args", False)
+    logits = torch.tensor([[0.3, -0.7, 1.0], [0.2, 0.1, 0.5]])
+    refused(lambda: distribution_class(**GOOD | {"gates": logits}), "gates of shape (2, 3)", "sigmoid")
 
 
 class Operations(TorchDispatchMode):

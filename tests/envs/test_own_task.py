@@ -51,7 +51,9 @@ def test_a_reward_or_an_end_of_another_shape_is_named(method):
     refused(lambda: step(wrong()), f"Wrong.{method}()", "(3, 1)", "(3,)")
 
 
-@pytest.mark.parametrize(("extra", "name"), [({"goal": None}, "goal"), ({"close": torch.zeros(3)}, "close")])
+@pytest.mark.parametrize(
+    ("extra", "name"), [({"observation": None}, "observation"), ({"close": torch.zeros(3)}, "close")]
+)
 def test_observations_of_another_shape_and_missing_ones_are_named(extra, name):
     def observe(self, ids):
         return {key: value for key, value in (Stand.observe(self, ids) | extra).items() if value is not None}

@@ -6,11 +6,14 @@ from hydra.utils import instantiate
 from refusals import refused
 from tensordict import TensorDict
 from torch import nn
+from torch.distributions import Independent, Laplace
 from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import NormalParamExtractor
 
 from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
 from torchrl_mcp.methods.actor import Sizes
-from torchrl_mcp.methods.mcp import composite_actor
+from torchrl_mcp.methods.mcp import composite_actor, composite_parts
+from torchrl_mcp.modules import JointGating, Primitives
 from torchrl_mcp.runs.configuration import compose_run
 
 MIXERS = {"multiplicative": MultiplicativeGaussian, "additive": AdditiveGaussian}
@@ -148,3 +151,55 @@ def infinite(logits):
 def test_weights_that_compose_nothing_are_refused_before_training(composite, activation):
     heads = {"gate_activation": activation, "distribution_class": MultiplicativeGaussian}
     refused(lambda: composite(**heads), "gating.activation")
+
+
+HEADS = {"gate_activation": nn.Sigmoid(), "distribution_class": MultiplicativeGaussian}
+
+
+def composed_of_policies(sizes, actions, **heads):
+    """Parts of a composite of two policies that exist."""
+    networks = [nn.Sequential(nn.Linear(sizes.observation, 2 * actions), NormalParamExtractor()) for _ in range(2)]
+    return composite_parts(
+        sizes,
+        gating=JointGating,
+        primitives=lambda *sizes, initial_std: Primitives.from_policies(networks),
+        num_primitives=2,
+        initial_std=0.01,
+        **HEADS | heads,
+    ), networks
+
+
+def test_policies_that_exist_are_composed_as_they_are(sizes, states):
+    parts, networks = composed_of_policies(sizes, sizes.action)
+    observation = states(20)["observation"]
+    loc, scale = parts["primitives"](observation)
+    for index, network in enumerate(networks):
+        torch.testing.assert_close((loc[:, index], scale[:, index]), network(observation))
+
+
+def test_policies_with_another_number_of_actions_are_refused(sizes):
+    refused(lambda: composed_of_policies(sizes, sizes.action + 1), str(sizes.action + 1), str(sizes.action))
+
+
+class WithoutAction(Independent):
+    """A mixer that has no action without exploration."""
+
+    def __init__(self, loc, scale, gates):
+        super().__init__(Laplace(loc.mean(-2), scale.mean(-2)), 1)
+
+
+class WithoutDeviation(WithoutAction):
+    """A mixer whose variance is unknown."""
+
+    deterministic_sample = property(lambda self: self.mean)
+
+    @property
+    def variance(self):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("mixer", "property_name"), [(WithoutAction, "deterministic_sample"), (WithoutDeviation, "stddev")]
+)
+def test_a_mixer_that_lacks_a_property_is_refused_before_training(mixer, property_name, composite):
+    refused(lambda: composite(**HEADS | {"distribution_class": mixer}), mixer.__name__, property_name)

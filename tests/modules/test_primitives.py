@@ -3,8 +3,11 @@ import math
 import pytest
 import torch
 from refusals import refused
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn import functional as F
+from torchrl.modules import MLP, IndependentNormal, NormalParamExtractor, ProbabilisticActor
 
 from torchrl_mcp.modules import Primitives
 from torchrl_mcp.modules.primitives import BatchedLinear
@@ -155,3 +158,57 @@ def test_linear_heads_are_linear_in_the_trunk_s_features():
         output = F.linear(features, primitives.output.weight[k].T, primitives.output.bias[k])
         torch.testing.assert_close(loc[:, k], output[:, :2])
         torch.testing.assert_close(scale[:, k], output[:, 2:].exp())
+
+
+class Posture(nn.Module):
+    """A policy without a hidden layer, whose standard deviation is one number."""
+
+    def __init__(self):
+        super().__init__()
+        self.loc = nn.Parameter(torch.tensor([0.3, -0.4]))
+
+    def forward(self, observation):
+        return self.loc.expand(*observation.shape[:-1], 2), torch.tensor(0.2)
+
+
+@pytest.fixture
+def actor(tmp_path):
+    """An actor of TorchRL from a file."""
+    network = nn.Sequential(MLP(5, 4, num_cells=[8]), NormalParamExtractor())
+    module = TensorDictModule(network, in_keys=[("seen", "observation")], out_keys=["loc", "scale"])
+    actor = ProbabilisticActor(module, in_keys=["loc", "scale"], distribution_class=IndependentNormal)
+    torch.save(actor, tmp_path / "actor.pt")
+    return torch.load(tmp_path / "actor.pt", weights_only=False)
+
+
+@pytest.mark.parametrize("batch", [(), (7,), (2, 3)])
+def test_policies_of_different_networks_are_primitives_as_they_are(batch, actor):
+    linear = nn.Sequential(nn.Linear(5, 4), NormalParamExtractor())
+    state = torch.randn(*batch, 5)
+    loc, scale = Primitives.from_policies([actor, linear, Posture()])(state)
+    assert loc.shape == scale.shape == (*batch, 3, 2)
+    distribution = actor.get_dist(TensorDict({("seen", "observation"): state}, batch))
+    torch.testing.assert_close((loc[..., 0, :], scale[..., 0, :]), (distribution.mean, distribution.stddev))
+    torch.testing.assert_close((loc[..., 1, :], scale[..., 1, :]), linear(state))
+    torch.testing.assert_close(loc[..., 2, :], torch.tensor([0.3, -0.4]).expand(*batch, 2))
+    assert (scale[..., 2, :] == 0.2).all()
+
+
+def test_policies_keep_their_parameters_and_can_be_frozen(actor):
+    policies = [actor, Posture()]
+    primitives = Primitives.from_policies(policies)
+    assert {*primitives.parameters()} == {parameter for policy in policies for parameter in policy.parameters()}
+    loc, _ = primitives.requires_grad_(False)(torch.randn(4, 5))
+    assert not loc.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("policies", "name"),
+    [
+        (lambda: [], "policies"),
+        (lambda: [Posture(), nn.Linear(5, 2)], "policy 1"),
+        (lambda: [Posture(), nn.Sequential(nn.Linear(5, 6), NormalParamExtractor())], "(4, 3)"),
+    ],
+)
+def test_policies_that_cannot_be_composed_are_refused(policies, name):
+    refused(lambda: Primitives.from_policies(policies())(torch.randn(4, 5)), name)

@@ -37,8 +37,9 @@ LONGER = "runs/test_places.py::test_a_longer_run_goes_on_from_another_folder_aft
 FAULTS = {
     # Distributions and networks
     "torchrl_mcp/distributions/multiplicative.py": [
-        ("(weights / total * loc).sum(-2)", "(weights / total * loc).mean(-2)", "distributions/test_multiplicative.py"),
-        ("weights = gates * (log", "weights = (log", "distributions/test_multiplicative.py"),
+        ("(precisions * loc).sum(-2)", "(precisions * loc).mean(-2)", "distributions/test_multiplicative.py"),
+        ("gates.unsqueeze(-1) * scale", "scale", "distributions/test_multiplicative.py"),
+        (".clamp_min(MIN_SCALE)", "", "distributions/test_multiplicative.py"),
     ],
     "torchrl_mcp/distributions/additive.py": [
         ("(gates * function(actions)).sum(0)", "function(actions).mean(0)", "distributions/test_additive.py"),
@@ -52,6 +53,7 @@ FAULTS = {
     "torchrl_mcp/distributions/primitives.py": [
         ("(gates >= 0)", "(gates > 0)", "distributions/test_validation.py"),
         ("(scale > 0)", "(scale >= 0)", "distributions/test_validation.py"),
+        ("negative = gates < 0", "negative = gates < -1", "distributions/test_validation.py"),
         ("if gates.shape[-1] != shape[-2]", "if False", "distributions/test_validation.py"),
     ],
     "torchrl_mcp/modules/gating.py": [
@@ -76,7 +78,9 @@ FAULTS = {
     ],
     # Methods
     "torchrl_mcp/methods/mcp.py": [
-        ("networks.rescale(initial_std / comp", "networks.rescale(1.0 / comp", "methods/test_composite.py"),
+        ("rescale(initial_std / comp", "rescale(1.0 / comp", "methods/test_composite.py"),
+        ("if loc.shape[-1] != sizes.action", "if False", "methods/test_composite.py"),
+        ("for name, use in needs.items()", "for name, use in ()", "methods/test_composite.py"),
         ('stored=("gates", *PRIMITIVES)', 'stored=("gates",)', "methods/test_composite.py methods/test_contract.py"),
         ('    require_frozen("primitives", frozen, over="weights")\n', "", "methods/test_exploration_over_weights.py"),
     ],

@@ -34,7 +34,7 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
             is the variance.)
         gates: Weights, shape ``(*B, K)``, non-negative and not all zero. They are normalised to sum to one.
         validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked.
+            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not

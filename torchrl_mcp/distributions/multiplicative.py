@@ -1,6 +1,5 @@
 """The multiplicative composition of Gaussian primitives (Eq. 3)."""
 
-import math
 from typing import Self
 
 from torch import Size, Tensor
@@ -12,7 +11,10 @@ from torchrl_mcp.distributions.primitives import GatedPrimitives, broadcast_prim
 # scale 1e3 still reaches it only below a gate of 0.01), and low enough that 6-sigma samples stay finite in float16
 # and their squares, divided by the smallest sensible variance, in float32.
 MAX_SCALE = 1e4
-LOG_PRECISION_FLOOR = -2 * math.log(MAX_SCALE)
+
+# The standard deviation as which that of a narrower primitive counts. It is far below the rounding of any action, and
+# its precision is finite in float32: a closed gate must remove a narrow primitive, and 0 * inf is NaN.
+MIN_SCALE = 1e-12
 
 
 class MultiplicativeGaussian(GatedPrimitives, Independent):
@@ -30,7 +32,8 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
 
     The precision :math:`1 / \sigma^2` is at least ``1e-8``, which is a standard deviation of ``1e4``. If the primitives
     result in less, a zero-mean Gaussian makes up the difference. If all gates are zero, the composite is therefore
-    :math:`\mathcal{N}(0, 10^8)` instead of a division by zero, and values and gradients remain finite.
+    :math:`\mathcal{N}(0, 10^8)` instead of a division by zero, and values and gradients remain finite. A primitive's
+    standard deviation below ``1e-12`` counts as ``1e-12``.
 
     Arguments of half precision are promoted to ``float32``, and samples are ``float32``, because a ``bfloat16``
     log-density over tens of actions is wrong by more than the clip range of a policy ratio.
@@ -41,7 +44,7 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
             is the variance.)
         gates: Weights, shape ``(*B, K)``, non-negative. They need not sum to one.
         validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked.
+            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
@@ -70,16 +73,11 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
     def __init__(self, loc: Tensor, scale: Tensor | float, gates: Tensor, validate_args: bool | None = None) -> None:
         loc, scale, gates = broadcast_primitives(loc, scale, gates, validate_args)
         self.loc, self.scale, self.gates = loc, scale, gates
-        gates = gates.unsqueeze(-1)
-        log_precision = -2 * scale.log()
-        # log sum_k w_k exp(x_k) around an anchor that cancels: unlike logsumexp(log w + x), it has a gradient at w = 0.
-        anchor = (gates.log() + log_precision).amax(-2, keepdim=True).clamp_min(LOG_PRECISION_FLOOR).detach()
-        # An exponent above 80 belongs to a closed gate, and would make its weight 0 * inf.
-        weights = gates * (log_precision - anchor).clamp_max(80.0).exp()
-        total = weights.sum(-2, keepdim=True).clamp_min((LOG_PRECISION_FLOOR - anchor).exp())
-        mean = (weights / total * loc).sum(-2)
-        stddev = (-(anchor + total.log()) / 2).exp().squeeze(-2)
-        super().__init__(Normal(mean, stddev, validate_args), 1, validate_args)
+        # Not gates / scale**2, whose gradient overflows already at scales of 1e-10.
+        precisions = gates.unsqueeze(-1) * scale.clamp_min(MIN_SCALE).reciprocal().square()
+        precision = precisions.sum(-2).clamp_min(MAX_SCALE**-2)
+        mean = (precisions * loc).sum(-2) / precision
+        super().__init__(Normal(mean, precision.rsqrt(), validate_args), 1, validate_args)
 
     def expand(self, batch_shape: Size | list[int] | tuple[int, ...], _instance: Distribution | None = None) -> Self:
         """Return the same distribution over a larger batch, without copying."""

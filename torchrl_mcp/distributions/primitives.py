@@ -58,7 +58,8 @@ def broadcast_primitives(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Check primitives and gates, and bring them to one floating-point type and one batch shape.
 
-    Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device.
+    Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device. By default,
+    gates on a CPU must not be negative, as raw logits are.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
@@ -83,6 +84,8 @@ def broadcast_primitives(
     shape = common_shape(loc, scale, gates)
     if Distribution._validate_args if validate_args is None else validate_args:
         check_values(loc, scale, gates)
+    elif validate_args is None and gates.device.type == "cpu" and not torch.compiler.is_compiling():
+        check_signs(gates)
     dtype = reduce(torch.promote_types, (loc.dtype, scale.dtype, gates.dtype), torch.float32)
     return loc.to(dtype).expand(shape), scale.to(dtype).expand(shape), gates.to(dtype).expand(shape[:-1])
 
@@ -101,6 +104,8 @@ def common_shape(loc: Tensor, scale: Tensor, gates: Tensor) -> Sequence[int]:
     remedy = "pass loc and scale of shape (*B, K, A) and gates of shape (*B, K)"
     if loc.ndim < 2 or gates.ndim < 1:
         raise ValueError(f"{shapes(loc, scale, gates)} lack a dimension for the primitives: {remedy}.")
+    if loc.shape == scale.shape and loc.shape[:-1] == gates.shape:  # nothing to broadcast, in a tenth of the time
+        return loc.shape
     try:
         shape = torch.broadcast_shapes(*given)
     except RuntimeError as error:
@@ -129,6 +134,20 @@ def check_values(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
         if not torch._is_all_true(valid):  # as in torch.distributions: all() fails under vmap
             first = value[~valid][0].item()
             raise ValueError(f"{name} of shape {tuple(value.shape)} contains {first}, but must be {rule}.")
+
+
+def check_signs(gates: Tensor) -> None:
+    """Check that gates are not negative: raw logits in their place would make a composite of NaN.
+
+    Raises:
+        ValueError: If a gate is negative, with the remedy.
+    """
+    negative = gates < 0
+    if not torch._is_all_true(~negative):
+        raise ValueError(
+            f"gates of shape {tuple(gates.shape)} contains {gates[negative][0].item()}, but must be non-negative. If "
+            "they are logits, end the gate in a sigmoid or a softmax."
+        )
 
 
 def shapes(loc: Tensor, scale: Tensor, gates: Tensor) -> str:

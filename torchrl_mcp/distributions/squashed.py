@@ -36,7 +36,7 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
         low: Lower bound :math:`l`, a number or shape ``(A,)``, in action units.
         high: Upper bound :math:`h`, a number or shape ``(A,)``, in action units.
         validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked.
+            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
 
     Raises:
         ValueError: If the shapes do not match, or if the numbers ``low`` and ``high`` are in the wrong order or

@@ -117,14 +117,21 @@ def normalise_inputs(parts: nn.ModuleDict) -> TensorDictSequential:
     """Return the module that standardises ``observation`` and ``goal``.
 
     It writes the results, of the same shapes, as ``("normalised", "observation")`` and ``("normalised", "goal")``.
+    Environments without a goal need no key ``goal``: if the normaliser has no features, the module makes an empty goal.
 
     Args:
         parts: Parts with ``observation_normaliser`` and ``goal_normaliser``, such as :func:`input_normalisers` makes.
     """
-    return TensorDictSequential(
-        TensorDictModule(parts["observation_normaliser"], in_keys=["observation"], out_keys=[STATE]),
-        TensorDictModule(parts["goal_normaliser"], in_keys=["goal"], out_keys=[GOAL]),
-    )
+    goal = TensorDictModule(parts["goal_normaliser"], in_keys=["goal"], out_keys=[GOAL])
+    if not parts["goal_normaliser"].get_buffer("mean").numel():
+        goal = TensorDictModule(_no_goal, in_keys=["observation"], out_keys=[GOAL])
+    observation = TensorDictModule(parts["observation_normaliser"], in_keys=["observation"], out_keys=[STATE])
+    return TensorDictSequential(observation, goal)
+
+
+def _no_goal(observation: Tensor) -> Tensor:
+    """Return empty goals, ``(*B, 0)``, for observations ``(*B, S)``."""
+    return observation[..., :0]
 
 
 def require_frozen(part: str, frozen: Collection[str], *, over: str) -> None:

@@ -24,7 +24,6 @@ from torchrl_mcp.methods.actor import (
     sampler,
 )
 from torchrl_mcp.modules.gaussian import state_independent_scale
-from torchrl_mcp.modules.primitives import Primitives
 
 
 def composite_parts(
@@ -32,7 +31,7 @@ def composite_parts(
     *,
     gating: Callable[..., nn.Module],
     gate_activation: Callable[[Tensor], Tensor],
-    primitives: Callable[..., Primitives],
+    primitives: Callable[..., nn.Module],
     num_primitives: int,
     distribution_class: Composition,
     initial_std: float,
@@ -44,10 +43,11 @@ def composite_parts(
         sizes: Sizes of state, goal and action.
         gating: Makes the network for gate logits from ``(S, G, K)``.
         gate_activation: From logits to weights: a sigmoid, or a softmax for mixtures.
-        primitives: Makes the primitives from ``(S, A, K, initial_std=)``; they need a method ``rescale`` like
-            :meth:`~torchrl_mcp.modules.Primitives.rescale`.
+        primitives: Makes the primitives from ``(S, A, K, initial_std=)``. Those without a method ``rescale``, such as
+            those of :meth:`~torchrl_mcp.modules.Primitives.from_policies`, keep their standard deviations.
         num_primitives: Number of primitives, ``K``.
-        distribution_class: The mixer, of ``(loc, scale, gates)``.
+        distribution_class: The mixer, of ``(loc, scale, gates)``. It needs the properties ``stddev`` and
+            ``deterministic_sample``.
         initial_std: Standard deviation of the *composite* before training, in action units, for any ``K``. It is a root
             mean square over normalised states and actions, and includes the variance of each primitive and the
             variance between the means of the primitives. The mixer's standard deviation must be proportional to that
@@ -59,7 +59,8 @@ def composite_parts(
         The parts by name.
 
     Raises:
-        ValueError: If ``num_primitives`` is not positive, or weights are negative, not finite or all zero.
+        ValueError: If ``num_primitives`` is not positive, if weights are negative, not finite or all zero, if
+            primitives have another number of actions, or if the mixer lacks a property.
 
     Example:
         See :func:`composite_actor`.
@@ -69,22 +70,39 @@ def composite_parts(
     # A composite's standard deviation is proportional to its primitives'. First compose K unit Gaussians at the gate's
     # initial weights and divide. Then do the same with the networks, whose primitives have different means.
     gates = _valid(gate_activation(torch.zeros(num_primitives)))
-    unit = torch.ones(num_primitives, 1)
-    composite = distribution_class(torch.zeros_like(unit), unit, gates)
+    unit_std = _unit_stddev(distribution_class, gates)
     gate = gating(sizes.observation, sizes.goal, num_primitives)
-    networks = primitives(
-        sizes.observation, sizes.action, num_primitives, initial_std=initial_std / composite.stddev.item()
-    )
+    networks = primitives(sizes.observation, sizes.action, num_primitives, initial_std=initial_std / unit_std)
     with torch.no_grad():
         states, goals = _normalised_inputs(sizes.observation, sizes.goal)
         loc, scale = networks(states)
+        if loc.shape[-1] != sizes.action:
+            raise ValueError(f"primitives have {loc.shape[-1]} actions, must have the task's {sizes.action}")
         weights = _valid(gate_activation(gate(states, goals)))
         composite = distribution_class(loc, scale, weights)
-        networks.rescale(initial_std / composite.stddev.square().mean().sqrt().item())
+        if rescale := getattr(networks, "rescale", None):
+            rescale(initial_std / composite.stddev.square().mean().sqrt().item())
     parts = nn.ModuleDict({**input_normalisers(sizes), "gating": gate, "primitives": networks})
     if learned_logits_std is not None:
         parts["gate_noise"] = state_independent_scale(learned_logits_std, num_primitives, learned=True)
     return parts
+
+
+def _unit_stddev(mixer: Composition, gates: Tensor) -> float:
+    """Return the standard deviation of unit Gaussians under gates ``(K,)``, after checking the mixer.
+
+    Raises:
+        ValueError: If the mixer lacks a property that training needs.
+    """
+    unit = torch.ones(len(gates), 1)
+    composite = mixer(torch.zeros_like(unit), unit, gates)
+    needs = {"stddev": "the noise before training", "deterministic_sample": "the action without exploration"}
+    for name, use in needs.items():
+        try:
+            getattr(composite, name)
+        except (AttributeError, NotImplementedError) as error:
+            raise ValueError(f"the mixer {type(composite).__name__} lacks {name}, {use}: add the property") from error
+    return composite.stddev.item()
 
 
 def _valid(weights: Tensor) -> Tensor:

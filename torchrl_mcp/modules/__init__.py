@@ -9,7 +9,7 @@ from torchrl_mcp.modules.gaussian import GaussianPolicy
 from torchrl_mcp.modules.injection import InjectedPolicy, InputInjection
 from torchrl_mcp.modules.latent import GoalEncoder, StateGoalEncoder
 from torchrl_mcp.modules.normaliser import RunningNormaliser
-from torchrl_mcp.modules.primitives import Primitives
+from torchrl_mcp.modules.primitives import PolicyPrimitives, Primitives
 
 __all__ = [
     "Gating",
@@ -18,6 +18,7 @@ __all__ = [
     "InjectedPolicy",
     "InputInjection",
     "JointGating",
+    "PolicyPrimitives",
     "Primitives",
     "RunningNormaliser",
     "StateGoalEncoder",

@@ -1,5 +1,6 @@
 """Gating networks, and diagnostics of their weights."""
 
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -122,14 +123,19 @@ def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
 
 
 def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:
-    """Return fully connected layers, each followed by a ReLU (Figure 3)."""
-    return MLP(
-        in_features=in_features,
-        out_features=num_cells[-1],
-        num_cells=list(num_cells[:-1]),
-        activation_class=nn.ReLU,
-        activate_last_layer=True,
-    )
+    """Return fully connected layers, each followed by a ReLU (Figure 3).
+
+    Without inputs, as for the goal of a task that has none, the features are constants.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Initializing zero-element tensors")
+        return MLP(
+            in_features=in_features,
+            out_features=num_cells[-1],
+            num_cells=list(num_cells[:-1]),
+            activation_class=nn.ReLU,
+            activate_last_layer=True,
+        )
 
 
 def at_least_single(values: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ class InputInjection(nn.Linear):
     Because of the zeros, a network has the same output before and after it gets the new inputs.
 
     Args:
-        in_features: Number of new inputs, ``G``.
+        in_features: Number of new inputs, ``G``; 0 for a task without a goal.
         out_features: Number of hidden units, ``H``.
 
     Reference:
@@ -32,6 +32,11 @@ class InputInjection(nn.Linear):
     def __init__(self, in_features: int, out_features: int) -> None:
         super().__init__(in_features, out_features, bias=False)
         nn.init.zeros_(self.weight)
+
+    def reset_parameters(self) -> None:
+        """Draw weights as :class:`torch.nn.Linear` does, unless there are none, of which torch would warn."""
+        if self.in_features:
+            super().reset_parameters()
 
 
 class InjectedPolicy(nn.Module):

@@ -21,12 +21,12 @@ class RunningNormaliser(nn.Module):
     normalise inputs before such a loss.
 
     Args:
-        size: Number of input features, ``F``.
+        size: Number of input features, ``F``; 0 for a goal of a task that has none.
         clip: Largest absolute output, :math:`c`.
         epsilon: Added to the variance.
 
     Raises:
-        ValueError: If ``size`` or ``clip`` is not positive.
+        ValueError: If ``size`` is negative or ``clip`` is not positive.
 
     Example:
         >>> import torch
@@ -43,8 +43,8 @@ class RunningNormaliser(nn.Module):
 
     def __init__(self, size: int, *, clip: float = 10.0, epsilon: float = 1e-8) -> None:
         super().__init__()
-        if size < 1:
-            raise ValueError(f"size must be a positive number of features, got {size}")
+        if size < 0:
+            raise ValueError(f"size must be a number of features, 0 or more, got {size}")
         if clip <= 0:
             raise ValueError(f"clip must be positive, got {clip}")
         self.clip = clip
@@ -80,7 +80,7 @@ class RunningNormaliser(nn.Module):
             Chan, Golub and LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, 1979.
         """
         self._require_features(x)
-        x = x.reshape(-1, x.shape[-1]).to(self.mean.dtype)
+        x = x.reshape(x.shape[:-1].numel(), x.shape[-1]).to(self.mean.dtype)
         good = x.abs() <= LARGEST
         if not (within := good.all(-1)).all():
             features = (~good).any(0).nonzero().flatten().tolist()
@@ -90,7 +90,7 @@ class RunningNormaliser(nn.Module):
                 stacklevel=2,
             )
             x = x[within]
-        if not len(x):
+        if not x.numel():
             return
         variance, mean = torch.var_mean(x, dim=0, correction=0)
         share = (x.shape[0] / (self.count + x.shape[0])).to(mean.dtype)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
@@ -83,6 +84,11 @@ class Primitives(nn.Module):
         loc, log_scale = self.output(features).chunk(2, dim=-1)
         return loc, (self.std_gain * at_least_single(log_scale)).exp()
 
+    @staticmethod
+    def from_policies(policies: Sequence[nn.Module]) -> "PolicyPrimitives":
+        """Return trained policies as primitives, see :class:`PolicyPrimitives`."""
+        return PolicyPrimitives(policies)
+
     @torch.no_grad()
     def rescale(self, factor: float) -> None:
         """Multiply all means and standard deviations by ``factor``, positive."""
@@ -90,6 +96,56 @@ class Primitives(nn.Module):
         self.output.weight[..., :action_dim] *= factor
         self.output.bias[:, :action_dim] *= factor
         self.output.bias[:, action_dim:] += math.log(factor) / self.std_gain
+
+
+class PolicyPrimitives(nn.Module):
+    r"""K Gaussian policies :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` as primitives, of any networks.
+
+    Args:
+        policies: Modules that return mean and standard deviation, ``(*B, A)``, for a state ``(*B, S)``, or TorchRL's
+            actors of one input, whose distribution takes these two. A standard deviation of fewer dimensions is
+            expanded.
+
+    Raises:
+        ValueError: If there are no policies.
+
+    Example:
+        >>> from torchrl_mcp.modules import GaussianPolicy, Primitives
+        >>> class Walk(nn.Module):
+        ...     def forward(self, state):
+        ...         return state[..., :2], torch.tensor(0.1)
+        >>> loc, scale = Primitives.from_policies([Walk(), Walk(), Walk()])(torch.zeros(5, 4))
+        >>> loc.shape, scale.shape
+        (torch.Size([5, 3, 2]), torch.Size([5, 3, 2]))
+    """
+
+    def __init__(self, policies: Sequence[nn.Module]) -> None:
+        super().__init__()
+        if not policies:
+            raise ValueError("policies is empty, must hold at least one")
+        self.policies = nn.ModuleList(_before_sampling(policy) for policy in policies)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means and standard deviations, each ``(*B, K, A)``, from a state ``(*B, S)``.
+
+        Raises:
+            ValueError: If a policy returns something else, or policies have different numbers of actions.
+        """
+        outputs = [policy(observation) for policy in self.policies]
+        if wrong := [k for k, output in enumerate(outputs) if not isinstance(output, tuple) or len(output) != 2]:
+            raise ValueError(f"policy {wrong[0]} must return mean and standard deviation, a tuple of two tensors")
+        means = [loc for loc, _ in outputs]
+        if wrong := [k for k, loc in enumerate(means) if loc.shape != means[0].shape]:
+            shapes = tuple(means[wrong[0]].shape), tuple(means[0].shape)
+            raise ValueError(f"policy {wrong[0]} returns means of shape {shapes[0]}, must be {shapes[1]} as policy 0's")
+        return torch.stack(means, -2), torch.stack([scale.expand_as(loc) for loc, scale in outputs], -2)
+
+
+def _before_sampling(policy: nn.Module) -> nn.Module:
+    """Return the part of a TorchRL actor that makes the parameters of its distribution; other policies as they are."""
+    if not isinstance(policy, ProbabilisticTensorDictSequential):
+        return policy
+    return policy.det_part.select_out_keys(*policy.dist_params_keys)
 
 
 class BatchedLinear(nn.Module):

@@ -55,8 +55,9 @@ def _adapted(env: Adapter) -> dict[str, str]:
 
 
 def _entries(env: CharacterEnv, key: str, layout: Mapping[str, slice]) -> list[dict[str, Any]]:
-    """Name, size and unit of each entry of an input; an input without a layout is one entry."""
-    layout = layout or {key: slice(0, env.observation_spec[key].shape[-1])}
+    """Name, size and unit of each entry of an input; an input without a layout is one entry, an empty one none."""
+    size = env.observation_spec[key].shape[-1]
+    layout = layout if layout or not size else {key: slice(0, size)}
     return [
         {
             "name": name,
