@@ -1,16 +1,20 @@
 """Every method trains in environments that are not the library's: both stages, evaluation, resuming, films."""
 
+import itertools
 import shutil
 
+import numpy as np
 import pytest
 import torch
-from points import LENGTH
+from PIL import Image
+from points import LENGTH, Point
 from refusals import refused
 from smoke import configure, final_parts, rows
 
-from torchrl_mcp.runs import experiment, records
+from torchrl_mcp.runs import experiment, policies, records
 from torchrl_mcp.runs.trust import trusting
 from torchrl_mcp.training.run_folder import EVALUATION, read_json
+from torchrl_mcp.viewer.film import save_film
 
 METHODS = ("scratch", "finetune", "hierarchical", "option_critic", "moe", "latent_space", "mcp")
 SETTINGS = ("observation=[observation,achieved_goal]", "info=[is_success]", "worst=-30", "solved=0")
@@ -102,3 +106,43 @@ def test_an_environment_that_does_other_than_its_specs_say_is_refused_before_the
         cfg = configure(tmp_path / "run", "method=scratch", "evaluation.episodes=3", *own)
         refused(lambda: experiment.train(cfg), "specs")
     assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+def spoilt(monkeypatch, outcome, *, after):
+    """Let Gymnasium's points fail or return something else after a number of steps of all of them."""
+    step, steps = Point.step, itertools.count()
+    monkeypatch.setattr(Point, "step", lambda point, action: outcome() if next(steps) > after else step(point, action))
+
+
+def die():
+    raise EOFError("the simulator has ended")
+
+
+def lose_count():
+    state = {key: np.array([np.nan]) for key in ("observation", "achieved_goal", "desired_goal")}
+    return {**state, "number": 0}, 0.0, False, False, {"is_success": False}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "error", "names"),
+    [(die, ChildProcessError, ["Point-v0", "EOFError"]), (lose_count, FloatingPointError, ["observation"])],
+)
+def test_a_run_whose_environment_fails_in_the_middle_is_resumed_from_its_last_checkpoint(
+    outcome, error, names, tmp_path, monkeypatch
+):
+    settings = ("method=scratch", "checkpoint_interval=1", *POINT, "training.total_frames=384", "evaluation.episodes=0")
+    with monkeypatch.context() as patch:
+        spoilt(patch, outcome, after=300)  # in the third batch of 128
+        refused(lambda: experiment.train(configure(tmp_path / "run", *settings)), *names, error=error)
+    assert [row["frames"] for row in rows(tmp_path / "run")] == ["128", "256"]
+    experiment.resume(tmp_path / "run")
+    assert [row["frames"] for row in rows(tmp_path / "run")] == ["128", "256", "384"]
+
+
+def test_a_policy_in_an_environment_that_draws_itself_is_filmed(runs, tmp_path):
+    folder = runs["transfer"]
+    _, agent, env = policies.restore(folder, num_envs=1, seed=0)
+    save_film(agent.actor.policy, env, tmp_path / "film.gif", seconds=1.0, width=60, height=40)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.size == (60, 40)
+        assert film.n_frames == 5  # of 10 steps, every second

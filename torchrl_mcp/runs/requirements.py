@@ -277,14 +277,17 @@ def _resolved(name: str) -> Any:
     """Return what a configuration names, which may be the user's.
 
     Raises:
-        ValueError: If Python finds another module of the name of the user's.
+        ValueError: If Python does not find it, or finds another module of the name of the user's.
     """
     try:
         return pkgutil.resolve_name(name)
-    except (AttributeError, ImportError):
+    except (AttributeError, ImportError) as error:
         if (top := name.partition(".")[0]) in sys.modules:
             _require_own(top, f"the configuration names {name}")
-        raise
+        raise ValueError(
+            f"the configuration names {name}, which Python cannot import: {error}. If the module is yours, call from "
+            "its folder, or add that to PYTHONPATH"
+        ) from error
 
 
 def _require_own(module: str, origin: str) -> None:
