@@ -34,7 +34,7 @@ ROOMS = (
     {"characters"},
     {"rendering"},
     {"motions"},
-    {"observations", "ideal", "curriculum", "initial_states"},
+    {"observations", "ideal", "curriculum", "initial_states", "steering"},
     {"base"},
     {"pd_character"},
     {"tasks"},

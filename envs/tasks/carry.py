@@ -8,9 +8,9 @@ import mujoco
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.base import UserGoal
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.rotations import about_z, heading, inverse, multiply, rotate
+from torchrl_mcp.envs.steering import UserGoal
 from torchrl_mcp.envs.tasks.objects import SceneObject, Weld, horizontal_extent, sensors
 from torchrl_mcp.envs.tasks.tables import (
     CLEARANCE,

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.arguments import interval, not_negative, positive
-from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import unit_vector
+from torchrl_mcp.envs.steering import Steerable, UserGoal
 from torchrl_mcp.envs.tasks.places import LOGARITHMIC
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward

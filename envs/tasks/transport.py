@@ -11,12 +11,12 @@ from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.arguments import positive
-from torchrl_mcp.envs.base import Steerable, UserGoal
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import transport_reach
 from torchrl_mcp.envs.observations import SIZES, UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rendering.camera import Arrow
+from torchrl_mcp.envs.steering import Steerable, UserGoal
 from torchrl_mcp.envs.tasks.objects import SceneObject
 from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from torchrl_mcp.envs.base import UserGoal
+from torchrl_mcp.envs.steering import UserGoal
 from torchrl_mcp.viewer.player import Player
 
 TURN = math.radians(15)
