@@ -95,8 +95,8 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
     """
     if cfg.method.explorer is None:
         raise ValueError(
-            f"method={cfg.method.name} has nothing to combine at random: give checkpoints of methods that have a "
-            "method.explorer, such as mcp; noise on actions, with which scratch begins, is drawn in any case"
+            f"method={cfg.method.name} has nothing to combine at random: pass checkpoints of methods that have a "
+            "method.explorer, such as mcp; the figure shows noise on actions, with which scratch begins, in any case"
         )
     return build.instantiate(cfg.method.explorer)(agent.parts, num, generator)
 
