@@ -50,7 +50,7 @@ class Curriculum:
 
     def __post_init__(self) -> None:
         if not 0 < self.discount <= 1:
-            raise ValueError(f"discount={self.discount} is out of range: pass the learner's, above 0 and at most 1")
+            raise ValueError(f"discount={self.discount} is out of range: pass that of the learner, above 0, at most 1")
         if self.reward_weights is not None and self.discount == 1:
             raise ValueError(
                 "reward_weights with discount=1 make a success worth infinite reward: pass a discount below 1"

@@ -163,7 +163,7 @@ def test_files_are_utf_8_in_any_locale(command, tmp_path, monkeypatch):
         ("--sides left", "'left' is not of the form RIGHT:LEFT, such as FR_:FL_"),
         ("--pose crouch", "--pose crouch is not a keyframe of the file: its keyframes are 0, 1"),
         ("--gain ankle=5", "--gain ankle=5 matches no joint: they are lwaist, pelvis, right_thigh"),
-        ("--root head", "there is no body head for the root: name one of torso, lwaist"),
+        ("--root head", "the file has no body head for the root: pass one of torso, lwaist"),
     ],
 )
 def test_what_is_wrong_with_an_option_is_said_in_a_sentence(command, tmp_path, options, message):

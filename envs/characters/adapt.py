@@ -61,13 +61,15 @@ def float_trunk(spec: mujoco.MjSpec, name: str | None = None) -> None:
     """
     candidates = {body.name: body for body in spec.worldbody.bodies}
     if not candidates:
-        raise ValueError("--floating needs a body in the file, which has none: name a file with bodies")
+        raise ValueError("--floating needs a body, but the file has none: pass a file with bodies")
     if name is None:
         name = max(candidates, key=lambda candidate: len(candidates[candidate].find_all("body")))
     if name not in candidates:
-        raise ValueError(f"--floating: {name} does not hang on the world: name one of {', '.join(candidates)} (--root)")
+        raise ValueError(
+            f"--floating: {name} must be attached to the world: pass one of {', '.join(candidates)} (--root)"
+        )
     if candidates[name].joints:
-        raise ValueError(f"--floating: {name} already has a joint: leave the option out, or name another --root")
+        raise ValueError(f"--floating: {name} already has a joint: leave the option out, or pass another --root")
     candidates[name].add_freejoint()
 
 
@@ -230,9 +232,9 @@ def _root(model: mujoco.MjModel, name: str | None) -> int:
     """Find the root: the body of a name, or the one on the world that carries the most bodies."""
     every = [model.body(body).name for body in range(1, model.nbody)]
     if not every:
-        raise ValueError("the file has no body")
+        raise ValueError("the file has no body: pass the file of a robot")
     if name is not None and name not in every:
-        raise ValueError(f"there is no body {name} for the root: name one of {', '.join(filter(None, every))}")
+        raise ValueError(f"the file has no body {name} for the root: pass one of {', '.join(filter(None, every))}")
     if name is not None:
         return every.index(name) + 1
     return int(np.bincount(model.body_rootid[1:]).argmax())
@@ -243,9 +245,9 @@ def _require_convertible(model: mujoco.MjModel, names: Mapping[int, str]) -> Non
     hanging = [body for body in _roots(model) if kinds_of(model, body) not in ([], [FREE])]
     if trunk in hanging and (len(hanging) > 1 or any(model.geom_type[model.geom_bodyid == 0] != PLANE)):
         raise ValueError(
-            f"{', '.join(model.body(body).name for body in hanging)} hang on the world by joints, because the trunk of "
-            "the file is fixed and part of the world: pass --floating, or let a joint of type floating connect a link "
-            "called world with the base of the URDF"
+            f"{', '.join(model.body(body).name for body in hanging)} are attached to the world by joints, because the "
+            "trunk of the file is fixed and part of the world: pass --floating, or let a joint of type floating "
+            "connect a link called world with the base of the URDF"
         )
     if trunk in hanging:
         raise ValueError(
@@ -285,7 +287,7 @@ def _feet(
     every = list(names.values())
     if given is not None:
         if unknown := [name for name in given if name not in every]:
-            raise ValueError(f"there is no body {', '.join(unknown)} for the feet: name some of {', '.join(every)}")
+            raise ValueError(f"the file has no body {', '.join(unknown)} for the feet: pass some of {', '.join(every)}")
         return tuple(given)
     if every[0] in lowest_bodies(posed)[1]:
         raise ValueError(

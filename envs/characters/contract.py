@@ -30,10 +30,10 @@ FOOT_HEIGHT = 0.03
 LIMB_FEET = 2
 """Largest number of feet on a line of bodies, such as heel and toes."""
 
-SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOf"contains a floor or other scenery ({', '.join(own)})", "remove it, because tasks add a floor")
 
 
-NAME_SIDES = "say how names tell the sides apart, such as --sides FR_:FL_ RR_:RL_, or rename bodies"
+NAME_SIDES = "pass how names begin or end on each side, such as --sides FR_:FL_ RR_:RL_, or rename bodies"
 
 
 class Violation(NamedTuple):
@@ -178,10 +178,10 @@ def kinds_of(model: mujoco.MjModel, body: int) -> list[int]:
 def _scenery(model: mujoco.MjModel) -> Iterator[Violation]:
     if fixed := [model.geom(geom).name or "unnamed" for geom in np.flatnonzero(model.geom_bodyid == 0)]:
         yield Violation(
-            f"has a floor or other scenery of its own ({', '.join(fixed)})", "remove it, tasks bring theirs"
+            f"contains a floor or other scenery ({', '.join(fixed)})", "remove it, because tasks add a floor"
         )
     if model.nlight:
-        yield Violation(f"has {model.nlight} light(s) of its own", "remove them, tasks bring theirs")
+        yield Violation(f"contains {model.nlight} light(s)", "remove them, because tasks add lights")
 
 
 def _defaults(spec: mujoco.MjSpec) -> Iterator[Violation]:
@@ -189,7 +189,7 @@ def _defaults(spec: mujoco.MjSpec) -> Iterator[Violation]:
         part.tag for part in ElementTree.fromstring(spec.to_xml()).findall("default/*") if part.tag != "default"
     ]:
         yield Violation(
-            f"has defaults of {', '.join(own)} in no class, which change the tasks' scenes, too",
+            f"has defaults of {', '.join(own)} outside a class, which also change the scenes of tasks",
             "put them into a named class, the childclass of the root",
         )
 
@@ -197,9 +197,9 @@ def _defaults(spec: mujoco.MjSpec) -> Iterator[Violation]:
 def _root(model: mujoco.MjModel) -> Iterator[Violation]:
     roots = np.flatnonzero(model.body_parentid[1:] == 0) + 1
     if len(roots) != 1:
-        yield Violation(f"has {len(roots)} bodies that hang on the world", "let one root carry all others")
+        yield Violation(f"has {len(roots)} bodies that are attached to the world", "let one root carry all others")
     if model.nbody > 1 and kinds_of(model, 1) != [FREE]:
-        yield Violation(f"the root {model.body(1).name} has no free joint, or others too", "give it a freejoint alone")
+        yield Violation(f"the root {model.body(1).name} must have a free joint and no other", "give it one freejoint")
 
 
 def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
@@ -213,7 +213,7 @@ def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
             continue
         if len(joints) > 1 and all(kind == HINGE for kind in kinds):
             names = ", ".join(model.joint(joint).name for joint in joints)
-            yield Violation(f"{name} has several hinges ({names}) where a ball is expected", "make them a ball joint")
+            yield Violation(f"{name} has several hinges ({names}), but may have one joint", "make them a ball joint")
         elif len(joints) > 1 or any(kind not in (BALL, HINGE) for kind in kinds):
             yield Violation(
                 f"{name} has joints that are neither a hinge nor a ball", "give it one of these, or weld it"
@@ -221,7 +221,7 @@ def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
         elif joints and model.joint(joints[0]).name != name:
             yield Violation(f"the joint of {name} is called {model.joint(joints[0]).name}", f"call it {name}")
         if any(kind == HINGE and not _holds_rest(model, joint) for joint, kind in zip(joints, kinds, strict=True)):
-            yield Violation(f"{name} rests beyond the limits of its joint", "widen its range to hold the rest pose")
+            yield Violation(f"{name} rests beyond the limits of its joint", "widen the range until it has the rest pose")
 
 
 def _holds_rest(model: mujoco.MjModel, hinge: int) -> bool:
@@ -257,10 +257,10 @@ def _actuators(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
     servo &= (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
     if torques := [model.actuator(index).name for index in np.flatnonzero(~servo)]:
         finding = f"{len(torques)} actuators are not position servos ({', '.join(torques)})"
-        yield Violation(finding, "make them <position>: targets would be taken for torques")
+        yield Violation(finding, "make them <position>, because others would take targets for torques")
     if free := [model.actuator(index).name for index in np.flatnonzero(model.actuator_ctrllimited == 0)]:
         yield Violation(
-            f"actuators have no ctrlrange ({', '.join(free)})", "give them one, to which actions are scaled"
+            f"actuators have no ctrlrange ({', '.join(free)})", "give them one, because actions are scaled to it"
         )
 
 
@@ -298,13 +298,13 @@ def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]], sides: Sides)
         yield Violation("no feet are named", f"name the bodies that may touch the ground, of {', '.join(bodies)}")
     for kind, names in named.items():
         if unknown := [name for name in names if name not in bodies]:
-            yield Violation(f"{kind} names {', '.join(unknown)}, which it lacks", f"name some of {', '.join(bodies)}")
+            yield Violation(f"{kind} names {', '.join(unknown)}, which the file lacks", f"name some of {', '.join(bodies)}")
     pairs = " ".join(f"{right}:{left}" for right, left in sides)
     sided = [name for name in bodies if name and twin(name, sides) != name]
     if alone := [name for name in sided if twin(name, sides) not in bodies]:
         yield Violation(f"{', '.join(alone)} has no twin on the other side ({pairs})", NAME_SIDES)
     elif not sided:
-        yield Violation(f"no body's name begins or ends with a side ({pairs or 'none is known'})", NAME_SIDES)
+        yield Violation(f"no name of a body begins or ends with a side ({pairs or 'none are known'})", NAME_SIDES)
     elif unlike := list(without_twin(model, sides)):
         yield Violation(f"the twin of {', '.join(unlike)} has other joints", "give both sides the same joints")
     touching = colliding_bodies(model)
@@ -318,7 +318,7 @@ def _symmetry(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
         return  # a violation of the names
     if crooked := list(without_mirror_image(model, sides)):
         yield Violation(
-            f"the frames of {', '.join(crooked)} are not mirror images of those of the other side in the rest pose",
+            f"the frames of {', '.join(crooked)} must mirror the frames on the other side in the rest pose",
             "turn them, with x forward and y to the left, or name all sides (--sides): mirrored motions would be wrong",
         )
 
@@ -331,7 +331,7 @@ def _facing(model: mujoco.MjModel, sides: Sides) -> Iterator[Violation]:
         on_right = [name for name in places if name.startswith(right) or name.endswith(right)]
         if sum(places[name] - places.get(twin(name, sides), places[name]) for name in on_right) > APART:
             remedy = f"turn the root, with x forward and y to the left, or exchange the sides ({left}:{right})"
-            yield Violation(f"{', '.join(on_right)} of the right side are on the left", remedy)
+            yield Violation(f"{', '.join(on_right)} belong to the right side, but are on the left", remedy)
 
 
 def _timestep(model: mujoco.MjModel) -> Iterator[Violation]:

@@ -121,8 +121,8 @@ def require_mirror_images(model: mujoco.MjModel, sides: Sides = SIDES) -> None:
         )
     if crooked := list(without_mirror_image(model, sides)):
         raise ValueError(
-            f"the frames of {', '.join(crooked)} are not mirror images of those of the other side in the rest pose: "
-            "turn them in the body's file, with x forward and y to the left, say how names tell the sides apart (sides "
+            f"the frames of {', '.join(crooked)} must mirror the frames on the other side in the rest pose: "
+            "turn them in the body's file, with x forward and y to the left, name the sides (sides "
             "of the Character), or do without mirror images"
         )
 

@@ -51,7 +51,7 @@ class Archive:
             with np.load(self.path, allow_pickle=False) as archive:
                 self.names: tuple[str, ...] = tuple(archive.files)
         except UNREADABLE as error:
-            raise self.error(f"is no NumPy archive: {error}. Write it anew with numpy.savez") from error
+            raise self.error(f"must be a NumPy archive ({error}): write it again with numpy.savez") from error
 
     def error(self, message: str) -> MotionFormatError:
         """Return an error about this file."""
@@ -79,7 +79,7 @@ class Archive:
             raise self.error(f"its array {name} holds a value that is not a finite number: correct it")
         if width and (array.shape[1:] != width or len(array) < 2):
             expected = ", ".join(map(str, width))
-            raise self.error(f"its array {name} has shape {array.shape}, and should have (T, {expected}) with T >= 2")
+            raise self.error(f"its array {name} has shape {array.shape}, but should have (T, {expected}) with T >= 2")
         return torch.from_numpy(array.astype(np.float64))
 
     def number(self, *names: str) -> float | None:

@@ -146,7 +146,7 @@ class MotionClip:
         """
         if not 0 <= start < stop <= self.duration + 1e-9:
             raise ValueError(
-                f"start={start}, stop={stop} is not a part of the clip: pass 0 <= start < stop <= {self.duration:g}"
+                f"start={start}, stop={stop} must be a part of the clip: pass 0 <= start < stop <= {self.duration:g}"
             )
         frames = max(1, round((stop - start) * self.fps))
         times = start + torch.arange(frames + 1, dtype=torch.float64) / self.fps
@@ -178,7 +178,7 @@ class MotionClip:
         except UNREADABLE as error:
             raise MotionFormatError(
                 path,
-                f"is not a motion clip: {error}. Pass one that torchrl-mcp-motions import has written, or import it "
+                f"must be a motion clip ({error}): pass one that torchrl-mcp-motions import has written, or import it "
                 "again",
             ) from error
 
@@ -191,11 +191,11 @@ class MotionClip:
         if character not in CHARACTERS:
             raise MotionFormatError(
                 path,
-                f"is a clip of character={character!r}, and known are {', '.join(CHARACTERS)}: name the module that "
+                f"is a clip of character={character!r}, but only {', '.join(CHARACTERS)} exist: name the module that "
                 "adds it (torchrl-mcp-motions --module), or take clips of another character",
             )
         if joints != (expected := joint_layout(character).names):
-            raise ValueError(f"it has the joints {joints}, and {character}'s model has {expected}")
+            raise ValueError(f"it has the joints {joints}, but the model of {character} has {expected}")
         return cls(character, torch.from_numpy(arrays["qpos"]), float(arrays["fps"]), loop=bool(arrays["loop"]))
 
     def _locate(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:

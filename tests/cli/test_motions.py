@@ -342,7 +342,7 @@ WRONG = {
     "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: there is no nowhere.bvh"),
     "missing clip": (["inspect", "nowhere.npz"], "torchrl-mcp-motions: .*nowhere.npz"),
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
-    "unknown kind": (["inspect", "notes.md"], r"notes\.md: ends in none of \.bvh"),
+    "unknown kind": (["inspect", "notes.md"], r"notes\.md: must end in \.bvh"),
     "no BVH": (["import", "cut.bvh"], r"cut\.bvh:1: does not begin with HIERARCHY"),
     "needless bodies": (
         ["import", "stand.txt", "--bodies", "bodies.yaml"],
@@ -355,7 +355,7 @@ WRONG = {
         "--module names nowhere, which Python does not find: call from the folder",
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
-    "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: give it \(--fps\)"),
+    "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: pass it \(--fps\)"),
     "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),

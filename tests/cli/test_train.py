@@ -152,7 +152,7 @@ def test_options_may_follow_settings_and_a_damaged_file_is_named(command, tmp_pa
     (tmp_path / "own/method").mkdir(parents=True)
     (tmp_path / "own/method/cut.yaml").write_text("defaults: [mcp")
     outcome = command("train", "seed=1", "--config-dir", "own", "method=cut", cwd=tmp_path)
-    assert "settings are not YAML: " in outcome.stderr
+    assert "YAML" in outcome.stderr
     assert "line 1" in outcome.stderr
     assert "Traceback" not in outcome.stderr
 

@@ -95,7 +95,7 @@ def test_without_what_writes_mp4_the_error_names_the_extra(tmp_path, monkeypatch
 
 
 def test_a_film_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"film\.avi is not the name of a film: end it with \.gif or \.mp4"):
+    with pytest.raises(ValueError, match=r"film\.avi must be the name of a film: end it with \.gif or \.mp4"):
         save_film(IDLE, heading(), tmp_path / "film.avi")
 
 

@@ -45,11 +45,13 @@ def walk_of(
     cfg = policies.policy_config(path)
     if cfg.task.name != "imitation":
         raise ValueError(
-            f"{path} is of task={cfg.task.name}: Figure 7 is of pre-training, give a run of task=imitation"
+            f"{path} has task={cfg.task.name}, but Figure 7 shows pre-training: pass a run of task=imitation"
         )
     _, agent, _ = policies.restore(path, num_envs=1, seed=seed)
     if "gates" not in agent.actor.stored:
-        raise ValueError(f"{path} is of method={cfg.method.name}, which has no weights: give a run of one with gates")
+        raise ValueError(
+            f"{path} has method={cfg.method.name}, which has no weights: pass a run of a method with a gate"
+        )
     clips = single_motion(cfg.character.name, clip)
     cfg, agent, env = policies.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
     walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
@@ -93,8 +95,8 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
     """
     if cfg.method.explorer is None:
         raise ValueError(
-            f"method={cfg.method.name} has nothing to combine at random: give checkpoints of methods that have a "
-            "method.explorer, such as mcp; noise on actions, with which scratch begins, is drawn in any case"
+            f"method={cfg.method.name} has nothing to combine at random: pass checkpoints of methods that have a "
+            "method.explorer, such as mcp; the figure shows noise on actions, with which scratch begins, in any case"
         )
     return build.instantiate(cfg.method.explorer)(agent.parts, num, generator)
 

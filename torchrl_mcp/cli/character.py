@@ -19,7 +19,7 @@ examples:
   {PROGRAM} adapt robot.xml --name robot2  # writes robot2.xml, robot2.py and own/character/robot2.yaml
   {PROGRAM} adapt robot.xml --name robot2 --pose home --sides FR_:FL_ RR_:RL_ --torque hip=24 calf=36 --gain .=50
 
-A PATTERN is a regular expression, which is searched for in the names of joints and bodies.
+A PATTERN is a regular expression. It applies to every joint or body whose name contains a match.
 """
 
 
@@ -37,7 +37,7 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = new_parser(PROGRAM, "Check whether an MJCF file is a character, or make one of it.", EXAMPLES)
+    parser = new_parser(PROGRAM, "Check whether an MJCF file is a character, or convert it into a character.", EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("file", type=Path, metavar="FILE", help="MJCF or URDF")
@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         "--feet",
         nargs="+",
         metavar="BODY",
-        help="bodies that may touch the ground (default: the lowest, at the ends of limbs)",
+        help="bodies that may touch the ground (default: the lowest bodies at the ends of limbs)",
     )
 
     shared.add_argument(
@@ -53,27 +53,38 @@ def parser() -> argparse.ArgumentParser:
         nargs="+",
         type=_pair,
         metavar="RIGHT:LEFT",
-        help="beginnings or ends of names on the right and on the left (default: usual ones that occur)",
+        help="how names of bodies on the right and on the left begin or end (default: usual pairs in the file)",
     )
 
     command = commands.add_parser(
-        "check", parents=[shared], help="list violations; the exit status is 1 if there are any"
+        "check",
+        parents=[shared],
+        help="list what keeps the file from being a character; the exit status is 1 if there is anything",
     )
     command.set_defaults(run="check")
-    command = commands.add_parser("adapt", parents=[shared], help="remove and convert parts to make a character")
+    command = commands.add_parser(
+        "adapt", parents=[shared], help="convert the file into a character, with its module and its configuration"
+    )
     command.add_argument("--name", type=_name, required=True, help="name of the character and of its files")
     command.add_argument("--output", type=Path, default=Path(), help="folder to write to (default here)")
-    command.add_argument("--root", metavar="BODY", help="body that carries the others (default: the most others)")
     command.add_argument(
-        "--floating", action="store_true", help="give the trunk a free joint, such as that of a URDF with a fixed base"
+        "--root", metavar="BODY", help="body that carries all others (default: the body that carries the most)"
     )
     command.add_argument(
-        "--pose", nargs="+", default=[], metavar="POSE", help="rest pose: a keyframe, and PATTERN=RADIANS of hinges"
+        "--floating", action="store_true", help="give the trunk a free joint first, for a URDF with a fixed base"
     )
-    for option, unit, what in (("torque", "NM", "limits of torques in N m"), ("gain", "KP", "gains in N m/rad")):
-        command.add_argument(
-            f"--{option}", nargs="+", default=[], type=_value, metavar=f"PATTERN={unit}", help=f"{what}, by joint"
-        )
+    command.add_argument(
+        "--pose",
+        nargs="+",
+        default=[],
+        metavar="POSE",
+        help="rest pose: a keyframe of the file, or angles of hinges as PATTERN=RADIANS",
+    )
+    for option, unit, what in (
+        ("torque", "NM", "torque limits of joints in N m"),
+        ("gain", "KP", "gains of joints in N m/rad"),
+    ):
+        command.add_argument(f"--{option}", nargs="+", default=[], type=_value, metavar=f"PATTERN={unit}", help=what)
     command.set_defaults(run="adapt")
     return parser
 
@@ -81,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
 def _pair(text: str) -> tuple[str, str]:
     right, _, left = text.partition(":")
     if not right or not left or right == left:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form RIGHT:LEFT, such as FR_:FL_")
+        raise argparse.ArgumentTypeError(f"{text!r} must have the form RIGHT:LEFT, such as FR_:FL_")
     return right, left
 
 
@@ -93,15 +104,17 @@ def _value(text: str) -> tuple[str, float]:
     except (re.error, ValueError):
         value = 0.0
     if not (pattern and 0 < value < float("inf")):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form PATTERN=NUMBER, such as ankle=50")
+        raise argparse.ArgumentTypeError(f"{text!r} must have the form PATTERN=NUMBER, such as ankle=50")
     return pattern, value
 
 
 def _name(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
-        raise argparse.ArgumentTypeError(f"{text!r} names a Python module, too: use small letters, digits and _")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} must also be the name of a Python module: use small letters, digits and _"
+        )
     if keyword.iskeyword(text) or yaml.safe_load(text) != text:
-        raise argparse.ArgumentTypeError(f"{text!r} is a word of Python or YAML: choose another name")
+        raise argparse.ArgumentTypeError(f"{text!r} has a meaning in Python or YAML: choose another name")
     return text
 
 

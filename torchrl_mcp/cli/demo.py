@@ -1,4 +1,4 @@
-"""``torchrl-mcp-demo``: a new gate over MCP's primitives beside scratch, after the same steps."""
+"""``torchrl-mcp-demo``: train a new gate over MCP's primitives and a network from scratch, with equal steps."""
 
 import argparse
 import sys
@@ -33,17 +33,17 @@ def main() -> None:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(
-        PROGRAM, "A new gate over MCP's primitives steers a humanoid, beside scratch after the same steps."
+        PROGRAM, "Train a new gate that steers a humanoid, and a network from scratch with the same number of steps."
     )
     parser.add_argument(
         "overrides",
         nargs="*",
         metavar="SETTING=VALUE",
-        help="settings of all runs, as for torchrl-mcp-train: seed=1",
+        help="settings of all runs, as for torchrl-mcp-train, such as seed=1",
     )
     parser.add_argument("--output", type=Path, help="folder (default runs/demo, or runs/demo-pretrain)")
-    parser.add_argument("--pretrain", action="store_true", help="train the primitives too, which takes longer")
-    parser.add_argument("--smoke", action="store_true", help="only test that the demonstration runs, in seconds")
+    parser.add_argument("--pretrain", action="store_true", help="also train the primitives, which takes longer")
+    parser.add_argument("--smoke", action="store_true", help="only test whether the demonstration runs, in seconds")
     return parser
 
 

@@ -68,19 +68,24 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = new_parser(PROGRAM, "Play episodes with a trained policy: returns, and diagnostics of gates and options.")
+    parser = new_parser(
+        PROGRAM, "Play episodes with a trained policy, and print returns and diagnostics of gates and options."
+    )
     parser.add_argument(
         "checkpoint",
         help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
     )
     defaults = settings("train")["evaluation"]
     for name, kind, meaning in (
-        ("episodes", count, "episodes, one per environment"),
+        ("episodes", count, "number of episodes, one in each environment"),
         ("seed", seed, "seed of environments and sampling"),
     ):
         parser.add_argument(f"--{name}", type=kind, default=defaults[name], help=f"{meaning} (default %(default)s)")
     parser.add_argument(
-        "--clips", type=count, metavar="N", help="imitation only: follow each reference motion alone, in N episodes"
+        "--clips",
+        type=count,
+        metavar="N",
+        help="also follow each reference motion by itself in N episodes (imitation only)",
     )
     add_task(parser)
     add_trust(parser)

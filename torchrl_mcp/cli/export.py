@@ -11,8 +11,8 @@ from torchrl_mcp.runs.builtin import locate
 PROGRAM = "torchrl-mcp-export"
 
 EXAMPLES = f"""\
-ONNX and torch's program take the environment's observation and goal, and return the deterministic action. A page runs
-physics and networks in the browser of whoever opens it, from any web server.
+ONNX files and torch programs take the observation and goal of the environment and return the deterministic action. A
+web page runs physics and networks in the browser of its reader, and needs any web server.
 
 examples:
   {PROGRAM} builtin:humanoid --onnx humanoid.onnx   # needs pip install 'torchrl-mcp[onnx]'
@@ -27,9 +27,9 @@ def main() -> None:
     options = parser()
     arguments = options.parse_args()
     if arguments.onnx is None and arguments.torch is None and arguments.page is None:
-        options.error("say what to write: --onnx FILE, --torch FILE or --page DIR")
+        options.error("choose what to write: --onnx FILE, --torch FILE or --page DIR")
     if arguments.gate and arguments.page is None:
-        options.error("--gate adds a gate to a page: say --page DIR too")
+        options.error("--gate adds a gate to a page: also pass --page DIR")
     path = locate(arguments.checkpoint)
     gates = [locate(gate) for gate in arguments.gate]
     announce(PROGRAM)
@@ -55,14 +55,16 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = new_parser(PROGRAM, "Write a trained policy for other programs, with its normalisers.", EXAMPLES)
+    parser = new_parser(
+        PROGRAM, "Write a trained policy with its normalisers for other programs, or as a web page.", EXAMPLES
+    )
     parser.add_argument(
         "checkpoint",
         metavar="CHECKPOINT",
         help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
     )
     add_trust(parser)
-    parser.add_argument("--onnx", type=Path, metavar="FILE", help="write ONNX")
+    parser.add_argument("--onnx", type=Path, metavar="FILE", help="write an ONNX file")
     parser.add_argument("--torch", type=Path, metavar="FILE", help="write a program for torch.export.load")
     parser.add_argument("--page", type=Path, metavar="DIR", help="write a folder with a web page")
     parser.add_argument(

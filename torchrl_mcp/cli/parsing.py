@@ -1,4 +1,4 @@
-"""Parsing that all commands share. It imports neither torch nor MuJoCo nor Hydra, which take seconds."""
+"""Parsing for all commands. This module imports neither torch nor MuJoCo nor Hydra, which take seconds to import."""
 
 import argparse
 import math
@@ -52,7 +52,7 @@ def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], 
                 if sys.flags.dev_mode:
                     raise
                 if isinstance(error, yaml.YAMLError):
-                    sys.exit(f"{program}: settings are not YAML: {' '.join(str(error).split())}")
+                    sys.exit(f"{program}: settings must be YAML: {' '.join(str(error).split())}")
                 sys.exit(f"{program}: {error}")
 
         return run
@@ -124,9 +124,8 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE",
-        help="let the checkpoint's configuration call classes and functions of this module of yours, "
-        "which may be in the working directory; repeatable. "
-        "Without it, a checkpoint runs only the library's code",
+        help="allow the checkpoint's configuration to call classes and functions of this module of yours, which may be "
+        "in the working directory; repeatable (default: a checkpoint runs only the library's code)",
     )
 
 
@@ -152,7 +151,7 @@ def add_task(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="an argument of the task, see below; repeatable",
+        help="argument of the task, listed below; repeatable",
     )
     lines = [f"{task}: {', '.join(names)}" for task, names in _task_arguments()]
     listed = "\n".join(textwrap.fill(line, 110, initial_indent="  ", subsequent_indent="    ") for line in lines)

@@ -53,10 +53,10 @@ def parse(words: list[str]) -> argparse.Namespace:
     arguments.checkpoint = None
     if arguments.agent is None:
         if len(arguments.settings) != 1:
-            options.error(f"give one CHECKPOINT, not {len(arguments.settings)}; or --agent, and task=... character=...")
+            options.error(f"pass one CHECKPOINT, not {len(arguments.settings)}; or --agent with task=... character=...")
         arguments.checkpoint = arguments.settings[0]
     if arguments.watch and (arguments.agent or not arguments.viewer or not Path(arguments.checkpoint).is_dir()):
-        options.error("--watch takes a run folder, and --viewer web or --viewer window")
+        options.error("--watch needs a run folder, and --viewer web or --viewer window")
     return arguments
 
 
@@ -68,35 +68,37 @@ def parser() -> argparse.ArgumentParser:
         nargs="*",
         metavar="CHECKPOINT",
         help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK; with "
-        "--agent instead settings of an environment, as for torchrl-mcp-train",
+        "--agent, settings of an environment instead, as for torchrl-mcp-train",
     )
     add_trust(parser)
-    parser.add_argument("--agent", choices=["zero", "random"], help="zero or random actions instead of a policy")
+    parser.add_argument("--agent", choices=["zero", "random"], help="play zero or random actions instead of a policy")
     parser.add_argument(
         "-cd", "--config-dir", type=Path, metavar="FOLDER", help="with --agent: folder of your own settings"
     )
     parser.add_argument("--seed", type=seed, default=0, help="seed of environment and sampling (default %(default)s)")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions (default: deterministic)")
+    parser.add_argument(
+        "--stochastic", action="store_true", help="sample actions (default: play deterministic actions)"
+    )
     add_task(parser)
     parser.add_argument(
         "--ghost-distance",
         type=float,
         default=1.0,
         metavar="D",
-        help="distance of the ghost in extents of the character; 0 for its true place (default %(default)s)",
+        help="distance of the ghost from its true place, in extents of the character (default %(default)s)",
     )
     film = parser.add_argument_group("film")
     film.add_argument("--output", type=Path, default=Path("film.gif"), help=".gif or .mp4 (default %(default)s)")
-    film.add_argument("--seconds", type=seconds, default=10.0, help="length of the film (default %(default)s)")
+    film.add_argument("--seconds", type=seconds, default=10.0, help="duration of the film (default %(default)s)")
     film.add_argument("--width", type=int, default=480, help="width in pixels (default %(default)s)")
     film.add_argument("--height", type=int, default=360, help="height in pixels (default %(default)s)")
     viewer = parser.add_argument_group("viewer")
     viewer.add_argument(
         "--viewer",
         choices=["web", "window"],
-        help="show it live instead: in a browser on this machine, or in a window",
+        help="play live instead of writing a film: in a browser on this machine, or in a window",
     )
-    viewer.add_argument("--watch", action="store_true", help="for a run in training: play each new checkpoint")
+    viewer.add_argument("--watch", action="store_true", help="play each new checkpoint of a run in training")
     viewer.add_argument("--port", type=port, default=0, help="port of the page (default: the first free one from 8080)")
     return parser
 

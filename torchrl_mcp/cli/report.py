@@ -1,4 +1,4 @@
-"""``torchrl-mcp-report``: the results of many runs beside the paper's, as a web page and as Markdown."""
+"""``torchrl-mcp-report``: the results of many runs beside the paper's results, as a web page and as Markdown."""
 
 import argparse
 import shlex
@@ -41,7 +41,9 @@ def main() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = new_parser(PROGRAM, "Write the results of many runs beside the paper's, as a web page and as Markdown.")
+    parser = new_parser(
+        PROGRAM, "Write the results of many runs beside the paper's results, as a web page and as Markdown."
+    )
     parser.add_argument("runs", type=Path, nargs="+", help="run folders, or folders with run folders at any depth")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write to (default %(default)s)")
     return parser

@@ -35,7 +35,9 @@ def main() -> None:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = new_parser(PROGRAM, "Show the progress of all runs of a folder.")
-    parser.add_argument("folder", type=Path, nargs="?", default=Path("runs"), help="of runs (default %(default)s)")
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=Path("runs"), help="folder of the runs (default %(default)s)"
+    )
     parser.add_argument("--follow", action="store_true", help="keep updating until interrupted")
     return parser
 

@@ -13,29 +13,29 @@ PROGRAM = "torchrl-mcp-train"
 
 GROUPS = {
     **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
-    "task": "imitation to pre-train, holdout in both stages, the others to transfer",
-    "character": "ant for holdout, any other for the other tasks",
-    "stage": "transfer needs pretrained=, for every method but scratch",
-    "preset": "fast learns best here, paper has Tables 5 to 11, comparison the same steps for every method",
-    "benchmark": "many runs of several methods",
-    "exploration": "action samples the composite action, weights the gate; MCP takes weights at transfer",
-    "curriculum": "training episodes: none for those of the evaluation, mixed for easier ones",
-    "motions": "references of imitation",
+    "task": "imitation is for pre-training, holdout for both stages, all others for transfer",
+    "character": "the ant does holdout only; all other characters do all other tasks",
+    "stage": "transfer needs pretrained=, except for the method scratch",
+    "preset": "fast learns best; paper has the values of Tables 5 to 11; comparison gives all methods equal steps",
+    "benchmark": "many runs, of several methods",
+    "exploration": "action samples the composite action, weights samples the gate; MCP uses weights at transfer",
+    "curriculum": "none trains with the episodes of the evaluation, mixed also with easier ones",
+    "motions": "reference motions of imitation",
     "imitation": "reward of imitation",
-    "physics": "engine of training episodes; warp computes on the GPU, with device=cuda and torchrl-mcp[warp]",
+    "physics": "engine of training episodes; warp runs on a GPU, and needs device=cuda and torchrl-mcp[warp]",
     **dict.fromkeys(("collector", "optimizer"), ""),
-    "logger": "beside metrics.csv",
+    "logger": "where metrics go, beside metrics.csv",
 }
 """Groups of settings for the command line and what they say; the choices of other groups come with a method."""
 
 SETTINGS = {
-    "run_dir=FOLDER": "run folder (default: below run_root, named after the settings)",
+    "run_dir=FOLDER": "run folder (default: in run_root, named after the settings)",
     "seed=N": "seed of networks, environments and sampling",
-    "pretrained=FOLDER": "run folder to transfer from, or builtin for the networks that come with the library",
-    "resume=FOLDER": "run folder to continue; also with device=, and training.total_frames=N to change its length",
+    "pretrained=FOLDER": "run folder to transfer from, or builtin for networks that come with the library",
+    "resume=FOLDER": "run folder to continue; device= and training.total_frames=N may change",
     "training.total_frames=N": "environment steps",
-    "width=FACTOR": "on the paper's hidden layers",
-    "device=cuda": "networks on a GPU; the physics only with physics=warp",
+    "width=FACTOR": "width of hidden layers, as a share of the paper's",
+    "device=cuda": "train networks on a GPU; for physics on the GPU, add physics=warp",
 }
 
 VALUED = (
@@ -101,12 +101,14 @@ def parser() -> argparse.ArgumentParser:
         PROGRAM, "Train a method on a task, as a single run, a Hydra multirun or a benchmark.", _epilog()
     )
     parser.add_argument("settings", nargs="*", metavar="SETTING=VALUE", help="see below")
-    parser.add_argument("-m", "--multirun", action="store_true", help="run every combination of values: seed=0,1,2")
+    parser.add_argument(
+        "-m", "--multirun", action="store_true", help="train with every combination of values, such as seed=0,1,2"
+    )
     parser.add_argument(
         "-cd",
         "--config-dir",
         metavar="FOLDER",
-        help="folder of your own settings; their modules may be in the working directory",
+        help="folder of your own settings, whose modules may be in the working directory",
     )
     parser.add_argument("-c", "--cfg", choices=["job", "hydra", "all"], help="print the configuration without training")
     parser.add_argument("--resolve", action="store_true", help="with --cfg: print values in place of references")
@@ -114,7 +116,7 @@ def parser() -> argparse.ArgumentParser:
         "-sc",
         "--shell-completion",
         action="store_true",
-        help="complete names in a shell: install it with -sc install=bash",
+        help="complete names in a shell; install this with -sc install=bash",
     )
     add_trust(parser)
     parser.add_argument("--hydra-help", action="store_true", help="print Hydra's own options")
@@ -123,10 +125,11 @@ def parser() -> argparse.ArgumentParser:
 
 SWEEPS = """\
 sweeps:
-  --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. Repeated, it skips complete runs,
-  continues the others, and tries failed ones again.
-  hydra/launcher=joblib or submitit_local: several at a time; slurm: on a cluster (pip install 'torchrl-mcp[launchers]')
-  hydra/launcher=ray_local or ray: by Ray (pip install 'torchrl-mcp[ray-launcher]')
+  --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. The same command again skips
+  complete runs, continues unfinished runs, and repeats failed ones.
+  hydra/launcher=joblib, submitit_local: several runs at a time (pip install 'torchrl-mcp[launchers]')
+  hydra/launcher=slurm: runs on a cluster (the same)
+  hydra/launcher=ray_local, ray: runs by Ray (pip install 'torchrl-mcp[ray-launcher]')
   hydra/sweeper=optuna: search for the best return (pip install 'torchrl-mcp[optuna]')"""
 
 

@@ -17,6 +17,6 @@ def require_format(path: Path) -> None:
         ValueError: If the suffix is unknown, or is ``.mp4`` and imageio-ffmpeg is not installed.
     """
     if path.suffix not in EVERY:
-        raise ValueError(f"{path} is not the name of a film: end it with .gif or .mp4")
+        raise ValueError(f"{path} must be the name of a film: end it with .gif or .mp4")
     if path.suffix == ".mp4" and find_spec(ENCODER) is None:
         raise ValueError(f"{path} needs imageio-ffmpeg: pip install 'torchrl-mcp[video]', or write a .gif")

@@ -104,7 +104,7 @@ def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.nda
     from scipy.stats import bootstrap  # slow to import
 
     if not strata or not all(len(values) for values in strata):
-        raise ValueError(f"values={list(map(list, strata))} hold an empty list: leave out what was not evaluated")
+        raise ValueError(f"values={list(map(list, strata))} contain an empty list: leave out what was not evaluated")
     value = float(statistic(*map(np.asarray, strata), axis=-1))
     if any(len(values) < 2 for values in strata):
         return Estimate(value)

@@ -197,8 +197,8 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
         for folder in sorted(_run_folders(path)):
             folders.setdefault(folder.resolve(), folder)
     if not folders:
-        empty = " and ".join(f"{path} holds no run" for path in paths)
-        raise ValueError(f"{empty}: give run folders, with {CONFIG} and {METRICS}, or folders of them")
+        empty = " and ".join(f"{path} contains no run" for path in paths)
+        raise ValueError(f"{empty}: pass run folders, with {CONFIG} and {METRICS}, or folders of them")
     outcomes = [read_run(folder) for folder in folders.values()]
     runs = [outcome for outcome in outcomes if isinstance(outcome, Run)]
     return runs, [outcome for outcome in outcomes if isinstance(outcome, Damaged)]

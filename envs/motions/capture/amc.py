@@ -75,7 +75,7 @@ def _beside(file: TextFile) -> Path:
     named = file.path.with_name(f"{file.path.stem.partition('_')[0]}.asf")
     candidates = [named] if named.is_file() else sorted(file.path.parent.glob("*.asf"))
     if len(candidates) != 1:
-        raise file.error(f"its skeleton {named.name} is not beside it: put it there, or say where it is")
+        raise file.error(f"its skeleton {named.name} must be beside it: put it there, or pass its path")
     return candidates[0]
 
 
@@ -114,17 +114,17 @@ def _frames(file: TextFile, skeleton: AsfSkeleton) -> Iterator[tuple[int, Mappin
                 yield start, frame
             [number] = file.numbers([name], line)
             if start and number != expected:
-                raise file.error(f"here is frame {number:g} and should be {expected:g}: correct it", line)
+                raise file.error(f"this is frame {number:g}, but should be {expected:g}: correct it", line)
             start = line
             frame = {}
             expected = number + 1
         elif not start:
-            raise file.error(f"{shortened(name)} stands before the first frame: pass an AMC file", line)
+            raise file.error(f"{shortened(name)} is before the first frame: pass an AMC file", line)
         elif name not in skeleton.bones or name in frame:
-            message = f"{shortened(name)} is there twice, or no bone of {skeleton.path.name}: pass its own skeleton"
+            message = f"{shortened(name)} occurs twice, or is not a bone of {skeleton.path.name}: pass another skeleton"
             raise file.error(message, line)
         elif len(words) != len(skeleton.bones[name].dof):
-            message = f"{name} has {len(words)} numbers and {len(skeleton.bones[name].dof)} channels: correct it"
+            message = f"{name} has {len(words)} numbers, but {len(skeleton.bones[name].dof)} channels: correct it"
             raise file.error(message, line)
         else:
             frame[name] = file.numbers(words, line)

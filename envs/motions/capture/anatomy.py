@@ -86,15 +86,15 @@ def find_joints(
     if missing := [part for part in parts if part not in joints]:
         raise MotionFormatError(
             source.path,
-            f"has no joint known as {', '.join(missing)}: say which it is with a map, such as "
+            f"has no joint that is known as {', '.join(missing)}: name it with a map, such as "
             f"{missing[0]}={_suggestion(missing[0], source)}; its joints are {', '.join(source.names)}",
         )
     trunk = source.ancestors(joints["root"])
     if wrong := [part for part in parts if part not in TRUNK and joints[part] in trunk]:
         raise MotionFormatError(
             source.path,
-            f"has its {wrong[0]} on {source.names[joints[wrong[0]]]}, which carries the whole body: say with a map "
-            f"which joint it is; its joints are {', '.join(source.names)}",
+            f"has its {wrong[0]} on {source.names[joints[wrong[0]]]}, which carries the whole body: name with a map "
+            f"the right joint; its joints are {', '.join(source.names)}",
         )
     return {part: joints[part] for part in parts}
 

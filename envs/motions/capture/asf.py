@@ -99,7 +99,7 @@ def _units(file: TextFile, section: Sequence[Statement]) -> tuple[float, bool]:
             case ["angle", ("deg" | "rad") as name]:
                 degrees = name == "deg"
             case ["angle", *_]:
-                raise file.error("the unit of angles is neither deg nor rad: correct it", statement.line)
+                raise file.error("the unit of angles must be deg or rad: correct it", statement.line)
     return unit, degrees
 
 
@@ -149,7 +149,7 @@ def _bone(file: TextFile, block: Mapping[str, Statement], line: int, degrees: bo
     if missing := {"name", "direction", "length"} - block.keys():
         raise file.error(f"a bone has no {', '.join(sorted(missing))}: add it", line)
     if len(block["name"].words) != 2:
-        raise file.error("the name of a bone is not one word: correct it", block["name"].line)
+        raise file.error("the name of a bone must be one word: correct it", block["name"].line)
     direction = torch.tensor(file.vector(block["direction"]), dtype=torch.float64)
     norm = float(torch.linalg.vector_norm(direction))
     if not 0.5 < norm < 2.0:
@@ -199,11 +199,11 @@ def _hierarchy(file: TextFile, section: Sequence[Statement], bones: Mapping[str,
             continue
         parent, *children = words
         if parent != "root" and parent not in parents:
-            raise file.error(f"{shortened(parent)} hangs on nothing yet: put its own line first", line)
+            raise file.error(f"{shortened(parent)} is not attached to a bone yet: put its line first", line)
         for child in children:
             if child not in bones or child in parents:
-                raise file.error(f"{shortened(child)} is not a bone, or hangs on two bones: correct it", line)
+                raise file.error(f"{shortened(child)} is not a bone, or is attached to two bones: correct it", line)
             parents[child] = parent
     if loose := sorted(bones.keys() - parents.keys()):
-        raise file.error(f"{shortened(loose[0])} hangs on nothing: add it to :hierarchy")
+        raise file.error(f"{shortened(loose[0])} is not attached to a bone: add it to :hierarchy")
     return parents

@@ -111,7 +111,7 @@ def _declared(file: TextFile, statement: Statement, joints: Sequence[_Joint], op
     if keyword == "ROOT":
         return _Joint(name, -1, statement.line)
     if not opened:
-        raise file.error(f"{keyword} stands outside of the root: check the braces", statement.line)
+        raise file.error(f"{keyword} is outside of the root: check the braces", statement.line)
     parent = opened[-1]
     return _Joint(f"{joints[parent].name}_end" if keyword == "END" else name, parent, statement.line)
 
@@ -141,7 +141,7 @@ def _motion(
     lines = array("q")
     for line, words in statements:
         if len(words) != width:
-            raise file.error(f"has {len(words)} numbers, and the skeleton has {width} channels: correct it", line)
+            raise file.error(f"has {len(words)} numbers, but the skeleton has {width} channels: correct it", line)
         values.extend(file.numbers(words, line))
         lines.append(line)
     declared = file.number(frames)
@@ -159,7 +159,7 @@ def _header(file: TextFile, statements: Iterator[Statement], key: str) -> Statem
         raise file.error(f"has no '{key}:': the file is cut short", file.text.count("\n") + 1)
     name, _, value = " ".join(statement.words).partition(":")
     if name.strip().lower() != key.lower() or len(value.split()) != 1:
-        raise file.error(f"here should be '{key}:' and a number: correct it", statement.line)
+        raise file.error(f"this line should be '{key}:' and a number: correct it", statement.line)
     return Statement(statement.line, [key, *value.split()])
 
 

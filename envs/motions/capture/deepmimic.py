@@ -70,9 +70,9 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
     try:
         content = json.loads(file.text)
     except json.JSONDecodeError as error:
-        raise file.error(f"is not JSON: {error.msg}", error.lineno) from error
+        raise file.error(f"must be JSON: {error.msg}", error.lineno) from error
     except (RecursionError, ValueError) as error:  # nested too deeply, or a number with too many digits
-        raise file.error(f"is not JSON of a motion: {error}", 1) from error
+        raise file.error(f"must be the JSON of a motion: {error}", 1) from error
     if not isinstance(content, dict) or not isinstance(content.get("Frames"), list) or len(content["Frames"]) < 2:
         raise file.error('has no list of two or more "Frames": pass a motion of DeepMimic or DeepLoco', 1)
     frames = content["Frames"]
@@ -86,7 +86,7 @@ def _content(file: TextFile) -> tuple[Tensor, bool]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, list) or len(frame) != width:
             raise file.error(
-                f"frame {index + 1} is not of {width} numbers as the first: correct it", _line(file, index)
+                f"frame {index + 1} must have {width} numbers, as the first frame: correct it", _line(file, index)
             )
         if not all(type(number) in (int, float) and abs(number) <= LARGEST_NUMBER for number in frame):
             message = f"frame {index + 1} holds a value that is not a number, not finite or absurdly large: correct it"

@@ -34,7 +34,7 @@ FRAME_0 = f"take its first frame as the standing pose (--rest-frame 0), which st
 REMEDIES = {
     "skeleton": f"take a frame that stands as the standing pose (--rest-frame), or {CORRECTIONS}",
     "clip": "correct the map of bodies (--bodies), or take another motion",
-    "deepmimic": "reorder its quaternions, or say that they are x, y, z, w (--quaternion xyzw); angles are in radians",
+    "deepmimic": "reorder its quaternions, or pass --quaternion xyzw if they are x, y, z, w; angles are in radians",
     "qpos": "correct the order of its joints (--joints) or of its quaternions (--quaternion); angles are in radians",
 }
 
@@ -125,7 +125,7 @@ def fit_clip(
     """Retarget a clip, unless it is of the same character. A cycle stays one, if no frames are left out."""
     if clip.character == character:
         if joint_map or bodies:
-            raise ValueError(f"{path} is of character={character} already, and needs no map: leave it out")
+            raise ValueError(f"{path} already is of character={character} and needs no map: leave the map out")
         clip = clip.section(skip / clip.fps, clip.duration) if skip else clip
         if rate is not None:
             require_frames(clip.duration, rate)

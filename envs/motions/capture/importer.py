@@ -237,11 +237,15 @@ def _format(path: str | Path) -> str:
             archive = Archive(path)
             return "clip" if "character" in archive.names else "smpl" if is_smpl(archive) else "qpos"
         case ".pkl" | ".pickle":
-            raise MotionFormatError(path, f"is a pickle, whose reading can run any code: {UNPICKLE}")
-    raise MotionFormatError(path, "ends in none of .bvh, .amc, .npz, .csv, .json and .txt: convert it to one of them")
+            raise MotionFormatError(path, f"is a pickle file, and reading it can run any code: {UNPICKLE}")
+    raise MotionFormatError(
+        path, "must end in .bvh, .amc, .npz, .csv, .json or .txt: convert it to one of these formats"
+    )
 
 
 def _require_order(quaternion: str) -> None:
     """Check the order of the components of quaternions."""
     if quaternion not in QUATERNIONS:
-        raise ValueError(f"quaternion={quaternion!r} is not an order: pass one of {', '.join(QUATERNIONS)}")
+        raise ValueError(
+            f"quaternion={quaternion!r} must be an order of components: pass one of {', '.join(QUATERNIONS)}"
+        )

@@ -46,7 +46,7 @@ def key_map(character: str, given: Mapping[str, str] | None = None) -> dict[str,
     bodies_by_part |= given
     if missing := [part for part in LEGS if part not in bodies_by_part]:
         raise ValueError(
-            f"{character} has no body known as {', '.join(missing)}: write a file with lines such as "
+            f"{character} has no body that is known as {', '.join(missing)}: write a file with lines such as "
             f"'{missing[0]}: BODY' (--bodies FILE.yaml); its bodies are {', '.join(bodies)}"
         )
     return {part: bodies_by_part[part] for part in PARTS if part in bodies_by_part}
@@ -61,9 +61,9 @@ def read_key_map(path: str | Path) -> dict[str, str]:
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no YAML: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"{path} must be YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(content, dict) or not all(isinstance(word, str) for pair in content.items() for word in pair):
-        raise ValueError(f"{path} should have lines of the form 'PART: BODY', such as 'left_knee: left_knee_link'")
+        raise ValueError(f"{path} must have lines of the form 'PART: BODY', such as 'left_knee: left_knee_link'")
     return content
 
 

@@ -67,7 +67,7 @@ def read_qpos(
         names = names[ROOT:]
     rate = frame_rate(fps, rate)
     if rate is None:
-        raise source.error("has no frame rate: give it (--fps)")
+        raise source.error("has no frame rate: pass it (--fps)")
     if len(values) < 2 or values.shape[1] < ROOT or len(values) / rate > LONGEST:
         raise source.error(
             f"has {len(values)} frames of {values.shape[1]} numbers at {rate:g} frames/s: pass two or more, up to an "
@@ -97,7 +97,7 @@ def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
     values = []
     for number, words in rows:
         if len(words) != width:
-            raise file.error(f"has {len(words)} numbers, and the first line has {width}: correct it", number)
+            raise file.error(f"has {len(words)} numbers, but the first line has {width}: correct it", number)
         values.append(file.numbers(words, number))
     return torch.tensor(values, dtype=torch.float64).view(len(values), width), names, None
 
@@ -115,7 +115,7 @@ def _root_order(file: TextFile, names: Sequence[str], quaternion: str | None) ->
         return ends[3:]
     if set(ends) <= set("wxyz") or any(re.match(r"time|frame|index|t$", name.lower()) for name in names):
         raise file.error(
-            f"its first {ROOT} columns are called {', '.join(names)}, which should be the root's position x, y, z and "
+            f"its first {ROOT} columns are called {', '.join(names)}, but should be the root's position x, y, z and "
             f"its quaternion {quaternion or ' or '.join(QUATERNIONS)}: correct the names, or the order of the columns",
             1,
         )
@@ -137,7 +137,7 @@ def _arrays(archive: Archive) -> tuple[Tensor, list[str] | None, float | None]:
             "root_rot and dof_pos"
         )
     if values.ndim != 2:
-        raise archive.error(f"qpos has shape {tuple(values.shape)}, and should have (T, N)")
+        raise archive.error(f"qpos has shape {tuple(values.shape)}, but should have (T, N)")
     names = [archive.array(key) for key in JOINTS if key in archive.names]
     return values, [str(name) for name in names[0].flatten()] if names else None, archive.number(*RATES)
 
@@ -159,7 +159,7 @@ def _columns(
         owners = [name if name in widths else re.sub(r"[._ ]?[wxyz]$", "", name) for name in owners]
     if len(owners) != width:
         raise source.error(
-            f"has {width} numbers after the root's {ROOT}, and the joints take {len(owners)}: name the joints of its "
+            f"has {width} numbers after the root's {ROOT}, but the joints need {len(owners)}: name the joints of its "
             f"columns (--joints); the character's are {', '.join(widths)}"
         )
     columns = {joint: [index for index, owner in enumerate(owners) if owner == joint] for joint in widths}
@@ -184,7 +184,7 @@ def _order(source: TextFile | Archive, model: mujoco.MjModel, root: Tensor) -> s
     if len(possible) != 1:
         raise source.error(
             f"its root is upright in most frames with {'both orders' if possible else 'no order'} of the quaternion's "
-            f"components: say which it is (--quaternion {' or '.join(QUATERNIONS)})"
+            f"components: pass the right one (--quaternion {' or '.join(QUATERNIONS)})"
         )
     return possible[0]
 

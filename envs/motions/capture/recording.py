@@ -119,7 +119,7 @@ def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scal
     if scale is not None:
         if not 0 < scale < math.inf:
             raise ValueError(
-                f"scale={scale} is not a unit of length: pass metres per unit, such as 0.01 for centimetres"
+                f"scale={scale} must be a unit of length: pass metres per unit, such as 0.01 for centimetres"
             )
         return scale
     length, (low, high) = _leg_length(positions), LEG_LENGTHS
@@ -128,7 +128,7 @@ def _metres_per_unit(source: SourceMotion, positions: Mapping[str, Tensor], scal
     if not low <= metres * length <= high:
         raise source.error(
             f"from hip to ankle it measures {length:.4g} units, which at {metres:.4g} m each are "
-            f"{metres * length:.3g} m and should be {low} to {high} m: give the scale, in metres per unit"
+            f"{metres * length:.3g} m, but should be {low} to {high} m: pass the scale, in metres per unit"
         )
     return metres
 
@@ -146,7 +146,7 @@ def _require_bones(source: SourceMotion, recording: Recording) -> None:
             lengths = torch.linalg.vector_norm(recording.positions[end] - recording.positions[start], dim=-1)
             if not lengths.min() > shortest:
                 message = (
-                    f"{start} and {end} come closer than {100 * shortest:.3g} cm: say with a map which joints they are"
+                    f"{start} and {end} come closer than {100 * shortest:.3g} cm: name the right joints with a map"
                 )
                 raise source.error(message, int(lengths.argmin()))
 

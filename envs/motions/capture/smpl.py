@@ -77,11 +77,11 @@ def read_smpl(path: str | Path, *, body_model: str | Path | None = None, fps: fl
     vectors = _vectors(archive)
     root = archive.numbers("trans", 3)
     if len(root) != len(vectors):
-        raise archive.error(f"has {len(vectors)} poses and {len(root)} positions in trans: they should be equally many")
+        raise archive.error(f"has {len(vectors)} poses and {len(root)} positions in trans: both numbers must be equal")
     _require_radians(archive, vectors)
     rate = frame_rate(fps, archive.number(*RATES))
     if rate is None:
-        raise archive.error(f"has no frame rate ({', '.join(RATES)}): give it (--fps)")
+        raise archive.error(f"has no frame rate ({', '.join(RATES)}): pass it (--fps)")
     if body_model is None:
         offsets = torch.tensor([offset for _, offset in SKELETON.values()], dtype=torch.float64)
     else:
@@ -107,14 +107,14 @@ def _vectors(archive: Archive) -> Tensor:
         body = archive.numbers("pose_body", 63)
         if len(root) != len(body):
             raise archive.error(
-                f"has {len(root)} rotations in root_orient and {len(body)} in pose_body: they should be equally many"
+                f"has {len(root)} rotations in root_orient and {len(body)} in pose_body: both numbers must be equal"
             )
         return torch.cat([root, body], dim=-1)
     poses = archive.numbers("poses")
     poses = poses.flatten(1) if poses.ndim > 1 else poses
     if poses.ndim != 2 or poses.shape[1] not in NUMBERS or len(poses) < 2:
         known = ", ".join(map(str, NUMBERS))
-        raise archive.error(f"poses has shape {tuple(poses.shape)}, and should have (T, N), T >= 2, N one of {known}")
+        raise archive.error(f"poses has shape {tuple(poses.shape)}, but should have (T, N), T >= 2, N one of {known}")
     return poses[:, : NUMBERS[0]]
 
 
@@ -133,7 +133,7 @@ def _shaped(model: Archive, betas: Tensor, parents: Sequence[int]) -> Tensor:
     r"""Offsets of the joints of a shape, :math:`J (\bar T + \sum_n \beta_n S_n)`, shape ``(22, 3)``."""
     template, shapes, regressor = (model.numbers(name) for name in ("v_template", "shapedirs", "J_regressor"))
     if shapes.ndim != 3 or template.shape != shapes.shape[:2] or regressor.shape[-1] != len(template):
-        raise model.error("v_template, shapedirs and J_regressor do not fit together: pass a body model of SMPL's")
+        raise model.error("v_template, shapedirs and J_regressor do not fit together: pass a body model of SMPL")
     used = betas.flatten()[: shapes.shape[-1]]
     positions = regressor[: len(parents)] @ (template + shapes[..., : len(used)] @ used)
     return torch.stack(

@@ -125,7 +125,7 @@ class TextFile:
     def _following(self, statement: Statement, count: int) -> list[float]:
         keyword, *words = statement.words
         if len(words) != count:
-            message = f"{shortened(keyword)} is followed by {len(words)} words and should be by {count}: correct it"
+            message = f"{shortened(keyword)} has {len(words)} words after it, but should have {count}: correct it"
             raise self.error(message, statement.line)
         return self.numbers(words, statement.line)
 

@@ -75,14 +75,14 @@ def upright(
         ValueError: If there is no such axis.
     """
     if up is not None and up not in VERTICALS:
-        raise ValueError(f"up={up!r} is not an axis: pass one of {', '.join(VERTICALS)}")
+        raise ValueError(f"up={up!r} must be an axis: pass one of {', '.join(VERTICALS)}")
     moving = _parts(joints, frames)
     body = _body(_parts(joints, rest))
     if body is None:
         named = "its rest pose" if rest_frame is None else f"frame {rest_frame}"
         raise source.error(
             f"{named} does not stand with the legs straight and the arms down or to the sides: "
-            f"{_remedy(moving, skip)}say with a map which joints are which (--map)"
+            f"{_remedy(moving, skip)}name the joints with a map (--map)"
         )
     nearest = _nearest(body)
     start = VERTICALS[nearest]
@@ -179,8 +179,8 @@ def _vertical(source: SourceMotion, frames: Mapping[str, Tensor], stated: str) -
     chosen = max(shares, key=lambda name: shares[name])
     if shares[chosen] <= 0.5:
         raise source.error(
-            f"its body stands in no frame if {stated} points up, and on the ground in most frames for no other axis: "
-            f"say which axis points up, such as --up {stated}, or give a frame that stands with --rest-frame"
+            f"its body does not stand in any frame if {stated} points up, and other axes are no better: "
+            f"pass the axis that points up, such as --up {stated}, or a frame that stands (--rest-frame)"
         )
     return chosen
 

@@ -118,7 +118,7 @@ def test_feet_must_be_bodies_with_shapes(feet, said):
     [
         ("-0.1 0 0", "0.1 0 0", FRAMES),  # it faces y
         ("0 0.2 0", "0 -0.1 0", FRAMES),
-        ("0 -0.1 0", "0 0.1 0", "right_leg of the right side"),
+        ("0 -0.1 0", "0 0.1 0", "right_leg belong to the right side"),
     ],
 )
 def test_left_and_right_are_on_their_sides(left, right, said):

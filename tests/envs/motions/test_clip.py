@@ -146,7 +146,7 @@ def test_a_section_is_the_clip_between_two_times():
 
 @pytest.mark.parametrize(("start", "stop"), [(-0.1, 0.3), (0.3, 0.3), (0.4, 0.2), (0.1, 9.0)])
 def test_a_section_outside_of_the_clip_is_refused(start, stop):
-    with pytest.raises(ValueError, match=r"is not a part of the clip: pass 0 <= start < stop <= 0\.6"):
+    with pytest.raises(ValueError, match=r"must be a part of the clip: pass 0 <= start < stop <= 0\.6"):
         random_clip()[0].section(start, stop)
 
 

@@ -162,19 +162,19 @@ def test_the_skeleton_may_be_named_or_the_only_one_in_the_folder(write):
     path.with_name("01.asf").rename(path.with_name("body.asf"))
     assert torch.equal(read_asf_amc(path).rotations, named.rotations)
     path.with_name("other.asf").write_text(ASF)
-    with pytest.raises(MotionFormatError, match=r"01_05\.amc: its skeleton 01\.asf is not beside it"):
+    with pytest.raises(MotionFormatError, match=r"01_05\.amc: its skeleton 01\.asf must be beside it"):
         read_asf_amc(path)
 
 
 WRONG_SKELETON = {
     "not ASF": (ASF, "hello", None, "has no section :bonedata, :hierarchy, :root"),
     "no hierarchy": (":hierarchy", ":hierarchi", None, "has no section :hierarchy"),
-    "no unit": ("length 0.45", "length", 6, "'length' is followed by 0 words and should be by 1"),
+    "no unit": ("length 0.45", "length", 6, "'length' has 0 words after it, but should have 1"),
     "zero unit": ("length 0.45", "length 0", 6, "is too small"),
-    "unit of angles": ("angle deg", "angle grad", 7, "neither deg nor rad"),
+    "unit of angles": ("angle deg", "angle grad", 7, "must be deg or rad"),
     "root channel": ("TX TY TZ RX", "TX TY TZ QX", 11, "channels other than tx ty tz rx ry rz"),
     "root axis": ("axis XYZ", "axis XXZ", 12, "order of the axes"),
-    "root position": ("position 7 8 9", "position 7 8", 13, "should be by 3"),
+    "root position": ("position 7 8 9", "position 7 8", 13, "should have 3"),
     "no name": ("    name lower\n", "", 33, "a bone has no name"),
     "no direction": ("    direction 0 -1 0\n", "", 33, "a bone has no direction"),
     "zero direction": ("direction 0 -1 0", "direction 0 0 0", 30, "the direction has length 0"),
@@ -188,22 +188,22 @@ WRONG_SKELETON = {
     "bone named root": ("name lower", "name root", 34, "a second bone 'root'"),
     "no end": ("  end\n:hierarchy", ":hierarchy", 40, "no 'end'"),
     "unknown child": ("upper lower fixed", "upper lower fixt", 45, "'fixt' is not a bone"),
-    "child twice": ("upper lower fixed", "upper lower lower", 45, "'lower' is not a bone, or hangs on two"),
-    "its own parent": ("root upper", "upper upper", 44, "'upper' hangs on nothing yet"),
-    "loose": ("upper lower fixed", "upper lower", None, "'fixed' hangs on nothing"),
+    "child twice": ("upper lower fixed", "upper lower lower", 45, "'lower' is not a bone, or is attached to two"),
+    "its own parent": ("root upper", "upper upper", 44, "'upper' is not attached to a bone yet"),
+    "loose": ("upper lower fixed", "upper lower", None, "'fixed' is not attached to a bone"),
 }
 
 WRONG_MOTION = {
     "empty": (AMC, "", None, "holds fewer than two frames"),
     "one frame": (AMC[AMC.index("2\nroot 4") :], "", None, "holds fewer than two frames"),
-    "no frame number": ("1\nroot", "root", 4, "'root' stands before the first frame"),
-    "frame left out": ("2\nroot", "3\nroot", 8, "here is frame 3 and should be 2"),
+    "no frame number": ("1\nroot", "root", 4, "'root' is before the first frame"),
+    "frame left out": ("2\nroot", "3\nroot", 8, "this is frame 3, but should be 2"),
     "absurd frame": ("2\nroot", "99999999\nroot", 8, "is absurdly large"),
-    "unknown bone": ("lower 70", "lowre 70", 7, r"'lowre' is there twice, or no bone of 01\.asf"),
-    "bone twice": ("lower 70", "upper 1 2 3", 7, "'upper' is there twice"),
-    "truncated row": ("upper 40 50 60", "upper 40 50", 6, "upper has 2 numbers and 3 channels"),
-    "long row": ("lower 70", "lower 70 80", 7, "lower has 2 numbers and 1 channels"),
-    "channels of a fixed bone": ("lower 70", "fixed 70", 7, "fixed has 1 numbers and 0 channels"),
+    "unknown bone": ("lower 70", "lowre 70", 7, r"'lowre' occurs twice, or is not a bone of 01\.asf"),
+    "bone twice": ("lower 70", "upper 1 2 3", 7, "'upper' occurs twice"),
+    "truncated row": ("upper 40 50 60", "upper 40 50", 6, "upper has 2 numbers, but 3 channels"),
+    "long row": ("lower 70", "lower 70 80", 7, "lower has 2 numbers, but 1 channels"),
+    "channels of a fixed bone": ("lower 70", "fixed 70", 7, "fixed has 1 numbers, but 0 channels"),
     "word": ("lower 70", "lower x", 7, "'x' is not a number"),
     "infinity": ("lower 70", "lower inf", 7, "'inf' is not finite"),
     "absurd number": ("lower 70", "lower -7e70", 7, "is absurdly large"),

@@ -128,7 +128,7 @@ def test_quaternions_in_another_order_are_refused_with_the_share_of_cut_frames_o
     rotation = quaternion([0.6, 0.0, 0.8], 20)
     frames = [frame(HUMANOID, chest=rotation, left_knee=-0.3)] * 4
     path = write([reordered(columns, HUMANOID) for columns in frames])
-    with pytest.raises(MotionFormatError, match=r"motion\.txt: in 100 % of its frames .* .--quaternion xyzw"):
+    with pytest.raises(MotionFormatError, match=r"motion\.txt: in 100 % of its frames .* --quaternion xyzw"):
         import_motion(path, "humanoid")
     found = import_motion(path, "humanoid", quaternion="xyzw")
     torch.testing.assert_close(found.qpos, import_motion(write(frames), "humanoid").qpos, rtol=0, atol=1e-12)

@@ -41,9 +41,9 @@ def write(tmp_path):
 
 
 WRONG = {
-    "empty": ("", 1, "is not JSON"),
-    "truncated": (lines(STANDING)[:-40], 5, "is not JSON"),
-    "binary": ("\x00\x01", 1, "is not JSON"),
+    "empty": ("", 1, "must be JSON"),
+    "truncated": (lines(STANDING)[:-40], 5, "must be JSON"),
+    "binary": ("\x00\x01", 1, "must be JSON"),
     "list": ("[1, 2]", 1, "no list of two or more"),
     "no frames": ('{"Loop": "none"}', 1, "no list of two or more"),
     "frames no list": ('{"Frames": 3}', 1, "no list of two or more"),
@@ -52,8 +52,8 @@ WRONG = {
     "loop a list": (lines(STANDING).replace('"none"', "[1]"), 1, "Loop"),
     "other character": (lines([columns[:36] for columns in STANDING]), 3, "the first frame has 36 numbers"),
     "frames of words": ('{"Frames":\n["a", "b"]}', 1, "the first frame has 0 numbers"),
-    "truncated row": (lines([STANDING[0], STANDING[1][:43], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
-    "row too short for a frame": (lines([STANDING[0], [7], STANDING[2]]), 4, "frame 2 is not of 44 numbers"),
+    "truncated row": (lines([STANDING[0], STANDING[1][:43], STANDING[2]]), 4, "frame 2 must have 44 numbers"),
+    "row too short for a frame": (lines([STANDING[0], [7], STANDING[2]]), 4, "frame 2 must have 44 numbers"),
     "NaN": (damaged(20, float("nan")), 4, "frame 2 holds a value that is not a number"),
     "infinity": (damaged(2, float("inf"), 2), 5, "frame 3 holds a value that is not a number"),
     "overflow": (lines(STANDING).replace("0.9", "1e999", 1), 3, "frame 1 holds a value that is not a number"),
@@ -67,8 +67,8 @@ WRONG = {
     "no rotation": (damaged(4, 0.0), 4, "quaternion of the root in frame 2 has length 0"),
     "hardly a rotation": (damaged(4, 0.05), 4, "quaternion of the root in frame 2 has length 0.05"),
     "jump": (lines(JUMP), 4, "the root jumps between frames 1 and 2"),
-    "nested": ("[" * 100_000, 1, "is not JSON of a motion"),
-    "digits": ('{"Frames": [[' + "9" * 5000 + "]]}", 1, "is not JSON of a motion"),
+    "nested": ("[" * 100_000, 1, "must be the JSON of a motion"),
+    "digits": ('{"Frames": [[' + "9" * 5000 + "]]}", 1, "must be the JSON of a motion"),
 }
 
 

@@ -145,7 +145,7 @@ def test_a_wrong_map_is_refused(given, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("- a", "should have lines of the form"), ("a: 1", "should have"), ("a: [", "is no YAML")]
+    ("text", "message"), [("- a", "must have lines of the form"), ("a: 1", "must have"), ("a: [", "must be YAML")]
 )
 def test_a_file_that_is_no_map_is_refused(tmp_path, text, message):
     (tmp_path / "bodies.yaml").write_text(text)
@@ -157,13 +157,13 @@ def test_a_character_without_known_legs_says_how_to_name_them(monkeypatch, tmp_p
     text = '<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
     (tmp_path / "blob.xml").write_text(text)
     monkeypatch.setitem(CHARACTERS, "blob", Character("blob", ("b",), (), None, tmp_path / "blob.xml"))
-    with pytest.raises(ValueError, match=r"blob has no body known as right_hip, .*'right_hip: BODY'.*--bodies"):
+    with pytest.raises(ValueError, match=r"blob has no body that is known as right_hip, .*'right_hip: BODY'.*--bodies"):
         key_map("blob")
 
 
 def test_a_body_without_known_sides_needs_a_map(monkeypatch):
     monkeypatch.setitem(CHARACTERS, "trex", replace(CHARACTERS["trex"], sides=()))
-    with pytest.raises(ValueError, match="trex has no body known as right_hip"):
+    with pytest.raises(ValueError, match="trex has no body that is known as right_hip"):
         key_map("trex")
 
 

@@ -93,7 +93,7 @@ def test_names_of_the_roots_columns_tell_the_order_of_its_quaternion(clips, tmp_
     header = ["root_x", "root_y", "root_z", "root_qx", "root_qy", "root_qz", "root_qw", *owners("humanoid")]
     path.write_text(table(reordered(clip), header))
     assert_same(import_motion(path, "humanoid", fps=clip.fps, rate=clip.fps), clip)
-    with pytest.raises(MotionFormatError, match=r"root_qx, root_qy, root_qz, root_qw, which should be .* wxyz"):
+    with pytest.raises(MotionFormatError, match=r"root_qx, root_qy, root_qz, root_qw, but should be .* wxyz"):
         import_motion(path, "humanoid", fps=clip.fps, quaternion="wxyz")
 
 
@@ -206,9 +206,9 @@ WRONG = {
     "too narrow": ("0,0,1\n" * 3, "has 3 frames of 3 numbers"),
     "too few joints": (
         "0,0,1,1,0,0,0,0\n" * 3,
-        r"has 1 numbers after the root's 7, and the joints take 22: .*--joints",
+        r"has 1 numbers after the root's 7, but the joints need 22: .*--joints",
     ),
-    "ragged": ("0,0,1,1,0,0,0\n0,0,1,1\n", r"csv:2: has 4 numbers, and the first line has 7: correct it"),
+    "ragged": ("0,0,1,1,0,0,0\n0,0,1,1\n", r"csv:2: has 4 numbers, but the first line has 7: correct it"),
     "a word": ("0,0,1,1,0,0,0\n0,0,1,1,0,0,x\n", r"csv:2: 'x' is not a number: correct it"),
     "decimal commas": ("0,0;0,0;1,0;1,0;0,0;0,0;0,0\n" * 3, r"csv:2: '0,0' is not a number: correct it"),
     "not finite": ("0,0,1,1,0,0,0\n0,0,1,nan,0,0,0\n", r"csv:2: 'nan' is not finite: correct it"),

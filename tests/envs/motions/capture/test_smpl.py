@@ -178,21 +178,21 @@ def test_a_body_model_gives_the_joints_of_a_shape_their_positions(write, tmp_pat
 GOOD = {"poses": np.zeros((5, 72)), "trans": np.zeros((5, 3)), "fps": 30.0}
 
 WRONG = {
-    "width": ({"poses": np.zeros((5, 75))}, r"poses has shape \(5, 75\), and should have \(T, N\).*66, 72, 156, 165"),
+    "width": ({"poses": np.zeros((5, 75))}, r"poses has shape \(5, 75\), but should have \(T, N\).*66, 72, 156, 165"),
     "one frame": ({"poses": np.zeros((1, 72)), "trans": np.zeros((1, 3))}, r"trans has shape \(1, 3\)|poses has shape"),
     "no frames": ({"poses": np.zeros((0, 72)), "trans": np.zeros((0, 3))}, "poses has shape|trans has shape"),
     "a number": ({"poses": np.float64(1.0)}, "poses has shape"),
-    "other length": ({"trans": np.zeros((4, 3))}, "has 5 poses and 4 positions in trans: they should be equally many"),
-    "flat trans": ({"trans": np.zeros((5, 2))}, r"its array trans has shape \(5, 2\), and should have \(T, 3\)"),
+    "other length": ({"trans": np.zeros((4, 3))}, "has 5 poses and 4 positions in trans: both numbers must be equal"),
+    "flat trans": ({"trans": np.zeros((5, 2))}, r"its array trans has shape \(5, 2\), but should have \(T, 3\)"),
     "not finite": ({"poses": np.full((5, 72), np.nan)}, "its array poses holds a value that is not a finite number"),
     "words": ({"trans": np.full((5, 3), "a")}, "its array trans holds a value that is not a finite number"),
-    "no rate": ({"fps": None}, r"has no frame rate .*: give it \(--fps\)"),
+    "no rate": ({"fps": None}, r"has no frame rate .*: pass it \(--fps\)"),
     "rate zero": ({"fps": 0.0}, "its fps must be a positive number"),
     "no trans": ({"trans": None}, "its array trans cannot be read"),
     "pickled": ({"trans": np.array([{}] * 5, dtype=object)}, "its array trans cannot be read"),
     "lies": (
         {"poses": np.tile([[0, 0, np.pi / 2]], (5, 24)) * np.eye(24).repeat(3, 1)[:1]},
-        "its body stands in no frame",
+        "its body does not stand in any frame",
     ),
 }
 
@@ -210,7 +210,7 @@ def test_a_body_model_of_another_kind_is_refused(write, tmp_path):
     np.savez(tmp_path / "model.npz", v_template=np.zeros((7, 3)), shapedirs=np.zeros((6, 3, 10)), J_regressor=np.eye(7))
     with pytest.raises(MotionFormatError, match=r"model\.npz: v_template, shapedirs and J_regressor do not fit"):
         import_motion(write(**GOOD, betas=np.zeros(10)), "humanoid", body_model=tmp_path / "model.npz")
-    with pytest.raises(MotionFormatError, match=r"nowhere\.npz: is no NumPy archive"):
+    with pytest.raises(MotionFormatError, match=r"nowhere\.npz: must be a NumPy archive"):
         import_motion(write(**GOOD, betas=np.zeros(10)), "humanoid", body_model=tmp_path / "nowhere.npz")
 
 

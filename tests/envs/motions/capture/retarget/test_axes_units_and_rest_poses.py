@@ -57,7 +57,7 @@ def test_the_unit_is_known_by_the_length_of_the_legs_or_said(load, unit, scale, 
 
 
 def test_legs_of_an_impossible_length_are_refused(load):
-    with pytest.raises(MotionFormatError, match=r"motion\.bvh: from hip to ankle .* 2\.79 m.*: give the scale"):
+    with pytest.raises(MotionFormatError, match=r"motion\.bvh: from hip to ankle .* 2\.79 m.*: pass the scale"):
         load([{}] * 2, unit=0.3048)
 
 

@@ -19,8 +19,8 @@ from torchrl_mcp.envs.motions.errors import MotionFormatError
         ({"joint_map": {"left_knee": "Nowhere"}}, r"motion\.bvh: has no joint 'Nowhere': its joints are Hips"),
         ({"joint_map": {"tail": "Hips"}}, "joint_map has tail: the parts of the body are root, chest"),
         ({"joint_map": {"left_wrist": "LeftForeArm"}}, r"motion\.bvh:\d+: left_elbow and left_wrist come closer"),
-        ({"scale": 0}, "scale=0 is not a unit"),
-        ({"scale": float("nan")}, "scale=nan is not a unit"),
+        ({"scale": 0}, "scale=0 must be a unit"),
+        ({"scale": float("nan")}, "scale=nan must be a unit"),
         ({"rate": -1}, "rate=-1 leaves less than two frames"),
         ({"skip": 3}, "skip=3 leaves less than two frames of 4"),
         ({"skip": -1}, "skip=-1 leaves"),
@@ -103,7 +103,7 @@ def test_what_limits_cut_is_measured_in_each_frame(bvh, tmp_path, about):
 @pytest.mark.parametrize("name", ["motion.fbx", "motion", "motion.asf"])
 def test_a_file_of_another_kind_is_refused(tmp_path, name):
     (tmp_path / name).write_text("?")
-    with pytest.raises(MotionFormatError, match="ends in none of"):
+    with pytest.raises(MotionFormatError, match=r"must end in \.bvh"):
         import_motion(tmp_path / name, "humanoid")
 
 

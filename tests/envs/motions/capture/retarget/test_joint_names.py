@@ -95,15 +95,17 @@ def test_a_map_wins_over_what_names_suggest(load, kinematics, any_pose, forward)
 
 def test_a_body_without_arms_will_do_for_the_biped(load, skeleton):
     legs = [joint for joint in skeleton if not re.search("Arm|Hand|Shoulder|Head|Neck", joint[0])]
-    with pytest.raises(MotionFormatError, match=r"no joint known as chest: .* its joints are Hips, Spine"):
+    with pytest.raises(MotionFormatError, match=r"no joint that is known as chest: .* its joints are Hips, Spine"):
         load([{}] * 2, "biped", body=legs)
     assert load([{}] * 2, "biped", body=legs, options={"joint_map": {"chest": "Chest"}}).character == "biped"
-    with pytest.raises(MotionFormatError, match="no joint known as chest, neck, right_shoulder, right_elbow"):
+    with pytest.raises(MotionFormatError, match="no joint that is known as chest, neck, right_shoulder, right_elbow"):
         load([{}] * 2, "humanoid", body=legs)
 
 
 def test_the_example_of_the_error_is_a_joint_of_that_name_or_none(load):
-    with pytest.raises(MotionFormatError, match=r"no joint known as neck: .* such as neck=UpperHeadJoint; its joints"):
+    with pytest.raises(
+        MotionFormatError, match=r"no joint that is known as neck: .* such as neck=UpperHeadJoint; its joints"
+    ):
         load([{}] * 2, rename=lambda name: {"Head": "UpperHeadJoint", "Neck": "LowerNeckJoint"}.get(name, name))
     with pytest.raises(MotionFormatError, match=r"such as neck=JOINT; its joints"):
         load([{}] * 2, rename=lambda name: {"Head": "Tete", "Neck": "Cou"}.get(name, name))
@@ -116,7 +118,9 @@ def test_the_example_of_the_error_is_no_end_site(bvh, tmp_path):
     head = text.index("}", text.index("UpperHeadJoint"))
     path = tmp_path / "motion.bvh"
     path.write_text(f"{text[:head]}End Site\n{{\nOFFSET 0 0.1 0\n}}\n{text[head:]}")
-    with pytest.raises(MotionFormatError, match=r"no joint known as neck: .* such as neck=UpperHeadJoint; its joints"):
+    with pytest.raises(
+        MotionFormatError, match=r"no joint that is known as neck: .* such as neck=UpperHeadJoint; its joints"
+    ):
         import_motion(path, "humanoid")
 
 
@@ -129,6 +133,6 @@ def test_the_head_is_known_by_several_names(load, any_pose, head):
 @pytest.mark.parametrize("part", ["neck", "left_knee", "right_shoulder"])
 def test_no_limb_and_no_head_begins_at_the_root(load, part):
     with pytest.raises(
-        MotionFormatError, match=rf"has its {part} on Hips, which carries the whole body: say with a map"
+        MotionFormatError, match=rf"has its {part} on Hips, which carries the whole body: name with a map"
     ):
         load([{}] * 2, options={"joint_map": {part: "Hips"}})
