@@ -58,8 +58,8 @@ def broadcast_primitives(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Check primitives and gates, and bring them to one floating-point type and one batch shape.
 
-    Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device. By default,
-    gates on a CPU must not be negative, as raw logits are.
+    Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device. By
+    default, gates on a CPU must not be negative, as raw logits are.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
