@@ -87,3 +87,12 @@ def test_a_hierarchical_gate_chooses_without_a_goal(tmp_path):
     before = fingerprint(trainer.agent.parts["gating"])
     trainer.run()
     assert fingerprint(trainer.agent.parts["gating"]) != before
+
+
+def test_an_environment_of_gymnasium_needs_no_goal(tmp_path):
+    settings = [setting for setting in SMALL if setting != "task=holdout"]
+    run = experiment.train(
+        smoke.configure(tmp_path / "run", *settings, "task=gymnasium", "task.pretrain.id=Pendulum-v1", "method=mcp")
+    )
+    results = policies.evaluation(run, episodes=2, seed=0)
+    assert results["deterministic"]["length"] == 200
