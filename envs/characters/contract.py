@@ -30,7 +30,7 @@ FOOT_HEIGHT = 0.03
 LIMB_FEET = 2
 """Largest number of feet on a line of bodies, such as heel and toes."""
 
-SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOf"contains a floor or other scenery ({', '.join(own)})", "remove it, because tasks add a floor")
+SHAPES = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
 
 
 NAME_SIDES = "pass how names begin or end on each side, such as --sides FR_:FL_ RR_:RL_, or rename bodies"
@@ -221,7 +221,9 @@ def _joints(model: mujoco.MjModel) -> Iterator[Violation]:
         elif joints and model.joint(joints[0]).name != name:
             yield Violation(f"the joint of {name} is called {model.joint(joints[0]).name}", f"call it {name}")
         if any(kind == HINGE and not _holds_rest(model, joint) for joint, kind in zip(joints, kinds, strict=True)):
-            yield Violation(f"{name} rests beyond the limits of its joint", "widen the range until it has the rest pose")
+            yield Violation(
+                f"{name} rests beyond the limits of its joint", "widen the range until it has the rest pose"
+            )
 
 
 def _holds_rest(model: mujoco.MjModel, hinge: int) -> bool:
@@ -298,7 +300,9 @@ def _names(model: mujoco.MjModel, named: dict[str, Sequence[str]], sides: Sides)
         yield Violation("no feet are named", f"name the bodies that may touch the ground, of {', '.join(bodies)}")
     for kind, names in named.items():
         if unknown := [name for name in names if name not in bodies]:
-            yield Violation(f"{kind} names {', '.join(unknown)}, which the file lacks", f"name some of {', '.join(bodies)}")
+            yield Violation(
+                f"{kind} names {', '.join(unknown)}, which the file lacks", f"name some of {', '.join(bodies)}"
+            )
     pairs = " ".join(f"{right}:{left}" for right, left in sides)
     sided = [name for name in bodies if name and twin(name, sides) != name]
     if alone := [name for name in sided if twin(name, sides) not in bodies]:

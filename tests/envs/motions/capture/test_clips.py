@@ -40,7 +40,7 @@ def test_frames_are_left_out_at_its_beginning(file):
 
 @pytest.mark.parametrize("options", [{"fps": 10.0}, {"joint_map": {"left_knee": "shin"}}])
 def test_options_that_would_change_nothing_are_refused(file, options):
-    with pytest.raises(ValueError, match="leave (it|the map) out"):
+    with pytest.raises(ValueError, match=r"leave (it|the map) out"):
         import_motion(file, "humanoid", **options)
 
 
