@@ -27,30 +27,32 @@ CONTROL_TIMESTEP = 0.05
 
 
 class Adapter(EnvBase):
-    r"""A batch of TorchRL environments with what training, evaluation and films ask for besides.
+    r"""A batch of TorchRL environments, extended by what training, evaluation and films need.
 
-    It satisfies :class:`~torchrl_mcp.adapters.contract.Environments`. Inputs are concatenated to the vectors
-    ``observation`` and ``goal``, float32; actions from -1 to 1 are scaled to the bounds of the environments.
+    The adapter satisfies :class:`~torchrl_mcp.adapters.contract.Environments`. Inputs are concatenated to the vectors
+    ``observation`` ``(N, S)`` and ``goal`` ``(N, G)``, float32. Actions ``(N, A)`` from -1 to 1 are scaled to the
+    bounds of the environments.
 
     Args:
         env: Environments, batch size ``[N]``: any ``EnvBase``, such as TorchRL's ``SerialEnv``, ``ParallelEnv``,
             ``GymWrapper`` of a ``VectorEnv``, or a wrapper of a batched simulator.
         observation: Keys of the state of the policy, in order.
-        goal: Keys of its goal, in order; none, ``()``, for environments without a goal. None takes ``desired_goal`` or
-            ``goal`` if the environments observe one of them.
-        goal_number: Key of the number of each episode's goal, one-hot or an integer, which ``method=hierarchical``
-            needs in pre-training: it trains a primitive for each goal. None for environments without such a number.
-        metrics: Keys of flags (bool) and numbers that are no inputs, such as ``success``.
+        goal: Keys of the goal of the policy, in order; ``()`` for environments without a goal. None takes
+            ``desired_goal`` or ``goal`` if the environments observe one of them.
+        goal_number: Key of the number of each episode's goal, one-hot or an integer; None for environments without such
+            a number. ``method=hierarchical`` needs it in pre-training, because it trains a primitive for each goal.
+        metrics: Keys of flags (bool) and numbers that are not inputs of the policy, such as ``success``.
         max_episode_steps: Steps after which an episode is ``truncated``, if it has not ended before. None takes the
-            attribute of that name of ``env``.
+            attribute of the same name of ``env``.
         worst: Return at which the normalised return is 0.
-        solved: Return at which it is 1. With ``worst`` 0 and ``solved`` 1, it is the return itself.
+        solved: Return at which the normalised return is 1. With ``worst`` 0 and ``solved`` 1, the normalised return is
+            the return itself.
         action_bounds: Lowest and highest action, in place of the bounds of ``env.action_spec``.
         control_timestep: Seconds of a step.
         render: Function that draws the environment of an index, ``(height, width, 3)``, uint8; None for no films.
-        snapshots: Whether ``env.state_dict()`` holds the whole state of the environments, also of their random
-            generators, so that they go on from there after ``load_state_dict``. A resumed run is then the same bit for
-            bit; otherwise it begins new episodes, with another seed.
+        snapshots: Whether ``env.state_dict()`` contains the whole state of the environments, including their random
+            generators, so that they continue from there after ``load_state_dict``. A resumed run is then the same bit
+            for bit; otherwise it begins new episodes, with another seed.
         name: Name of the environments in errors; their class by default.
 
     Raises:

@@ -86,7 +86,7 @@ class Primitives(nn.Module):
 
     @staticmethod
     def from_policies(policies: Sequence[nn.Module]) -> "PolicyPrimitives":
-        """Return trained policies as primitives, see :class:`PolicyPrimitives`."""
+        """Make primitives from trained policies, see :class:`PolicyPrimitives`."""
         return PolicyPrimitives(policies)
 
     @torch.no_grad()
@@ -102,15 +102,17 @@ class PolicyPrimitives(nn.Module):
     r"""K Gaussian policies :math:`\pi_k(a|s) = \mathcal{N}(\mu_k(s), \Sigma_k(s))` as primitives, of any networks.
 
     Args:
-        policies: Modules that return mean and standard deviation, ``(*B, A)``, for a state ``(*B, S)``, or TorchRL's
-            actors of one input, whose distribution takes these two. A standard deviation of fewer dimensions is
-            expanded.
+        policies: Modules that return mean and standard deviation, ``(*B, A)``, for a state ``(*B, S)``; or actors of
+            TorchRL with one input, whose distribution takes a mean and a standard deviation. A standard deviation with
+            fewer dimensions is expanded.
 
     Raises:
         ValueError: If there are no policies.
 
     Example:
-        >>> from torchrl_mcp.modules import GaussianPolicy, Primitives
+        >>> import torch
+        >>> from torch import nn
+        >>> from torchrl_mcp.modules import Primitives
         >>> class Walk(nn.Module):
         ...     def forward(self, state):
         ...         return state[..., :2], torch.tensor(0.1)
@@ -122,7 +124,7 @@ class PolicyPrimitives(nn.Module):
     def __init__(self, policies: Sequence[nn.Module]) -> None:
         super().__init__()
         if not policies:
-            raise ValueError("policies is empty, must hold at least one")
+            raise ValueError("policies is empty: pass at least one policy")
         self.policies = nn.ModuleList(_before_sampling(policy) for policy in policies)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
