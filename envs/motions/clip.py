@@ -20,7 +20,7 @@ from torchrl_mcp.envs.motions.placement import Placement, placing
 from torchrl_mcp.envs.rotations import continuous, inverse, multiply, slerp, to_rotation_vector
 
 OPEN = 0.2
-"""Angle in radians of a joint between the ends of a clip from which on the clip is no loop."""
+"""Angle in radians by which a joint may differ between the ends of a clip that loops."""
 
 
 @dataclass(frozen=True, eq=False)

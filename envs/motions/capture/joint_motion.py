@@ -26,7 +26,7 @@ LONGEST = 3600.0
 HIGHEST_RATE = 1000.0
 
 NO_ROTATION = 0.1
-"""Length below which a quaternion is no rotation; longer ones are normalised."""
+"""Least length of a quaternion that is a rotation; such quaternions are normalised."""
 
 QUATERNIONS = ("wxyz", "xyzw")
 """Orders of the components of quaternions in files."""

@@ -99,7 +99,7 @@ def _limbs(bodies: list[str], sides: Sides) -> dict[str, str]:
 
 
 def _has(name: str, word: str, outer: Sequence[str]) -> bool:
-    """Whether a name has a word that is no part of a word for an outer part, as arm is of forearm."""
+    """Whether a name has a word, but not inside a word for an outer part, as arm is inside forearm."""
     return word in name and not any(word in longer and longer in name for longer in outer)
 
 
