@@ -24,6 +24,8 @@ TASKS = {  # characters that can do it, the one it takes by default, and its sta
     "imitation": (WALKERS, "biped", {"pretrain"}),
     "location": (WALKERS, "biped", {"transfer"}),
 }
+OTHERS = {"gymnasium", "torchrl"}
+"""Tasks of other libraries, which have bodies of their own."""
 
 
 def composed(*overrides):
@@ -32,8 +34,16 @@ def composed(*overrides):
 
 def test_there_are_no_others():
     assert len(METHODS) == 7
-    assert set(CHARACTERS) == WALKERS | {"ant"}
-    assert {path.stem for path in (CONF / "task").glob("*.yaml")} == set(TASKS)
+    assert set(CHARACTERS) == WALKERS | {"ant", "none"}
+    assert {path.stem for path in (CONF / "task").glob("*.yaml")} == set(TASKS) | OTHERS
+
+
+@pytest.mark.parametrize(("task", "stage", "method"), product(sorted(OTHERS), STAGES, METHODS))
+def test_tasks_of_other_libraries_have_every_method_in_both_stages_and_no_character(task, stage, method):
+    own = "task.pretrain.env._target_=torchrl.envs.GymEnv" if task == "torchrl" else "task.pretrain.id=Pendulum-v1"
+    cfg = composed(f"task={task}", f"stage={stage}", f"method={method}", own)
+    assert cfg.character.name == "none"
+    require_environment(cfg)
 
 
 @pytest.mark.parametrize(

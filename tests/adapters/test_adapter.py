@@ -4,6 +4,7 @@ import pytest
 import torch
 from points import Lasting, Points
 from refusals import refused
+from torchrl.collectors import Collector
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import check_env_specs
 
@@ -235,3 +236,25 @@ def test_what_does_other_than_its_specs_say_is_refused():
         return outcome.set("far", torch.zeros(3, 2, dtype=torch.bool))
 
     refused(lambda: require_specs(adapted(Changed(act=wide), metrics=["far"])), "Adapter")
+
+
+class Closing(Points):
+    """Points that note whether they were closed, as those with processes of their own must be."""
+
+    closed = False
+
+    def close(self, **kwargs):
+        self.closed = True
+        super().close(**kwargs)
+
+
+def test_a_collector_that_is_shut_down_closes_the_environments():
+    points = Closing()
+    env = adapted(points)
+    collector = Collector(
+        env, env.rand_action, frames_per_batch=6, total_frames=-1, auto_register_policy_transforms=False
+    )
+    next(iter(collector))
+    assert not points.closed
+    collector.shutdown()
+    assert points.closed

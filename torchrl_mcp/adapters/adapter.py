@@ -100,6 +100,7 @@ class Adapter(EnvBase):
         if solved == worst:
             raise ValueError(f"worst={worst} and solved={solved} must differ, because returns are scaled to them")
         super().__init__(device=env.device or torch.device("cpu"), batch_size=env.batch_size)
+        self.is_closed = False  # collectors close what is open
         self.name = name
         self.num_envs: int = env.batch_size[0]
         self.max_episode_steps = int(limit)
@@ -112,10 +113,10 @@ class Adapter(EnvBase):
         spec = env.observation_spec
         observed_goals = [key for key in GOALS if key in spec.keys(True)][:1]
         self._inputs = {
-            "observation": Vector("observation", observation, spec),
-            "goal": Vector("goal", observed_goals if goal is None else goal, spec),
+            "observation": Vector("observation", name, observation, spec),
+            "goal": Vector("goal", name, observed_goals if goal is None else goal, spec),
         }
-        self._metrics = {key: Vector("metrics", [key], spec) for key in metrics}
+        self._metrics = {key: Vector("metrics", name, [key], spec) for key in metrics}
         self._flags = [key for key in metrics if spec[key].dtype is torch.bool]
         self._number = None if goal_number is None else Number(goal_number, spec)
         self.num_goals = self._number.count if self._number else 0
@@ -187,8 +188,8 @@ class Adapter(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environments."""
-        if not self._env.is_closed:
-            self._env.close()
+        if not self.is_closed:
+            self._env.close(raise_if_closed=False)
         super().close(raise_if_closed=raise_if_closed)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

@@ -18,6 +18,7 @@ class Vector:
 
     Args:
         name: Name of the vector in errors.
+        owner: Name of the environments in errors.
         keys: Keys of the observations, in order; without any, the vector has no entries.
         spec: What the environments observe, batch size ``[N]``.
 
@@ -28,8 +29,9 @@ class Vector:
         ValueError: If an observation is missing, or an image.
     """
 
-    def __init__(self, name: str, keys: Sequence[NestedKey], spec: Composite) -> None:
+    def __init__(self, name: str, owner: str, keys: Sequence[NestedKey], spec: Composite) -> None:
         self.name = name
+        self.owner = owner
         self.keys = list(keys)
         self._num_envs = spec.shape[0]
         self.size = sum(self._size_of(key, spec) for key in self.keys)
@@ -47,8 +49,8 @@ class Vector:
         if not vectors.isfinite().all():
             number, entry = (~vectors.isfinite()).nonzero()[0].tolist()
             raise FloatingPointError(
-                f"entry {entry} of the {self.name} became {vectors[number, entry]} in environment {number}: correct "
-                "the environment, or end the episode before"
+                f"entry {entry} of the {self.name} became {vectors[number, entry]} in environment {number} of "
+                f"{self.owner}: correct the environment, or end the episode before"
             )
         return vectors
 
@@ -62,7 +64,7 @@ class Vector:
             )
         if key not in observed:
             raise ValueError(
-                f"{self.name} names {key}, which the environment does not observe: it observes "
+                f"{self.name} names {key}, which {self.owner} does not observe: it observes "
                 f"{', '.join(map(str, observed))}. Pass {self.name}=[...] with some of them"
             )
         return math.prod(spec[key].shape[1:])

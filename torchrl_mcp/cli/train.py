@@ -13,8 +13,8 @@ PROGRAM = "torchrl-mcp-train"
 
 GROUPS = {
     **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
-    "task": "imitation is for pre-training, holdout for both stages, all others for transfer",
-    "character": "the ant does holdout only; all other characters do all other tasks",
+    "task": "imitation is for pre-training; holdout, gymnasium and torchrl for both stages; all others for transfer",
+    "character": "the ant does holdout only, none is for gymnasium and torchrl, and all others do all other tasks",
     "stage": "transfer needs pretrained=, except for the method scratch",
     "preset": "fast learns best; paper has the values of Tables 5 to 11; comparison gives all methods equal steps",
     "benchmark": "many runs, of several methods",

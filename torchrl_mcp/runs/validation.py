@@ -79,6 +79,8 @@ RANGE = Rule(
     lambda value: _is_list(value, _is_number) and len(value) == 2 and value[0] <= value[1],
 )
 
+NUMBER = Rule("a finite number", _is_number)
+
 SPEED = Rule(
     "a finite number above 0, or a range [low, high] from at least 0",
     lambda value: POSITIVE.allows(value) or (RANGE.allows(value) and value[0] >= 0),
@@ -113,18 +115,22 @@ NAMES_BY_RULE: dict[Rule, str] = {
     FLAG: """
         progress_bar fused entropy_bonus functional contact_forces self_collision learned_std terminate_on_fall
         terminate_when_unhealthy success_reward waypoint parts.blind on_device random_first_length restart_noise
-        action_noise
+        action_noise snapshots
     """,
     RANGE: """
         healthy_z_range initial_directions near_objects near object_distances
         object_directions target_distances target_directions target_intervals
         evaluation.directions environment.directions directions.pretrain directions.transfer pretrain.directions
-        transfer.directions
+        transfer.directions action_bounds
     """,
     RANGE.or_null(): "final_directions",
+    NUMBER: "worst solved",
     WIDTHS: "num_cells state_cells goal_cells joint_cells trunk_cells values_cells",
     WEIGHTS.or_null(): "reward_weights",
-    NAMES: "transfer.freeze transfer.keep",
+    NAMES: """
+        transfer.freeze transfer.keep pretrain.observation transfer.observation pretrain.goal transfer.goal
+        pretrain.info transfer.info pretrain.metrics transfer.metrics
+    """,
     TEXT: "device run_dir run_root",
     TEXT.or_null(): "pretrained resume goal_entry",
     _among(True, False, "auto"): "autocast",
