@@ -207,15 +207,15 @@ def test_the_primitives_had_as_many_steps_of_imitation_as_it_says():
 
 def test_the_return_is_shown_once_full_episodes_can_have_ended(tmp_path):
     cfg = demo.configure(tmp_path, [], preset="demo", pretrain=False)["mcp"]
-    rows = "".join(f"{i},{1024 * i},{0.5 if i < 18 else 0.75}\n" for i in range(1, 30))
+    rows = "".join(f"{i},{2048 * i},{0.5 if i < 18 else 0.75}\n" for i in range(1, 30))
     Path(cfg.run_dir).mkdir()
     lines = rows.splitlines(keepends=True)
     metrics = Path(cfg.run_dir, "metrics.csv")
     shown = {}
-    for count in (18, 29):  # 32 environments with episodes of 600 steps: 19,200
+    for count in (18, 29):  # 64 environments with episodes of 600 steps: 38,400
         metrics.write_text("iteration,frames,episode/normalised_return\n" + "".join(lines[:count]))
         shown[count] = demo.progress(cfg)
-    assert shown == {18: (18 * 1024, None), 29: (29 * 1024, 0.75)}
+    assert shown == {18: (18 * 2048, None), 29: (29 * 2048, 0.75)}
 
 
 @pytest.mark.parametrize("override", ["nonsense=1", "seed", "evaluation.episodes=0"])
