@@ -305,14 +305,14 @@ class OwnEnvs(Adapter):
     """Environments that a function makes, for ``task=torchrl``.
 
     Args:
-        env: Function that makes the environments as ``env(num_envs=, seed=)``, batch size ``[num_envs]``. If it takes
-            no ``num_envs``, it makes a single one, and TorchRL's ``SerialEnv`` puts as many side by side.
+        env: Function ``env(num_envs=, seed=)`` that makes environments of batch size ``[num_envs]``. A function without
+            ``num_envs`` makes a single environment, and TorchRL's ``SerialEnv`` puts several side by side.
         num_envs: Number of environments.
-        seed: Their seed.
+        seed: Seed of the environments.
         **settings: Passed on to :class:`Adapter`.
 
     Raises:
-        ValueError: As :class:`Adapter`.
+        ValueError: For the reasons of :class:`Adapter`.
     """
 
     def __init__(self, env: Callable[..., EnvBase], num_envs: int, *, seed: int | None = None, **settings: Any) -> None:

@@ -25,22 +25,24 @@ FINAL = ("final_observation", "final_obs")
 class GymnasiumEnvs(Adapter):
     """N environments of Gymnasium side by side, for ``task=gymnasium``.
 
-    They are a ``SyncVectorEnv`` of Gymnasium in TorchRL's ``GymWrapper``; with ``collector=processes`` there is one in
-    each process. The first is drawn with ``render_mode="rgb_array"`` if it is alone, as in films.
+    They are a ``SyncVectorEnv`` of Gymnasium in TorchRL's ``GymWrapper``. With ``collector=processes`` each process has
+    one. If there is a single environment, as in films, it has ``render_mode="rgb_array"``.
 
     Args:
-        id: Name for ``gymnasium.make``, also ``module:name``.
+        id: Name for ``gymnasium.make``, such as ``HalfCheetah-v5`` or ``module:name``.
         num_envs: Number N of environments.
-        seed: Seed of the first; each next one has the next seed.
+        seed: Seed of the first environment; the others have the seeds that follow.
         kwargs: Further arguments of ``gymnasium.make``.
         info: Names of entries of ``info`` that are metrics, such as ``is_success``.
-        max_episode_steps: Time limit in place of Gymnasium's own.
+        max_episode_steps: Steps after which an episode is ``truncated``; None for the limit of Gymnasium.
         **settings: Passed on to :class:`~torchrl_mcp.adapters.adapter.Adapter`.
 
     Raises:
-        ValueError: If there is no such environment, or as :class:`~torchrl_mcp.adapters.adapter.Adapter`.
+        ValueError: If there is no such environment, or for the reasons of
+            :class:`~torchrl_mcp.adapters.adapter.Adapter`.
 
     Example:
+        >>> from torchrl_mcp.adapters.gym import GymnasiumEnvs
         >>> env = GymnasiumEnvs("Pendulum-v1", 2, seed=0)
         >>> env.rollout(3)["next", "observation"].shape
         torch.Size([2, 3, 3])
