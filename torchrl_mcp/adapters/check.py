@@ -1,4 +1,4 @@
-"""The check of the contract, before a training spends its budget."""
+"""The check of the contract, which a training makes before it begins."""
 
 import logging
 from collections.abc import Iterator
@@ -12,19 +12,19 @@ from torchrl.envs import EnvBase, check_env_specs
 from torchrl_mcp.adapters.contract import Environments
 
 MEMBERS = sorted(name for name in vars(Environments) | Environments.__annotations__ if not name.startswith("_"))
-"""Names of everything that the contract asks for."""
+"""Names of all members that the contract needs."""
 
 REMEDY = "wrap the environment in torchrl_mcp.adapters.adapter.Adapter, which adds what is missing"
 
 
 def require_contract(env: Any) -> None:
-    """Check that environments satisfy :class:`~torchrl_mcp.adapters.contract.Environments`, without a step.
+    """Check that environments satisfy :class:`~torchrl_mcp.adapters.contract.Environments`, without taking a step.
 
     Args:
         env: The environments.
 
     Raises:
-        ValueError: If they do not, with the first thing that is missing.
+        ValueError: If they do not. The message names the first thing that is missing.
     """
     if wrong := next(deviations(env), None):
         raise ValueError(f"{type(env).__name__} cannot be trained in, because {wrong}: {REMEDY}")
@@ -33,7 +33,7 @@ def require_contract(env: Any) -> None:
 def require_specs(env: EnvBase) -> None:
     """Check that environments do what their specs say, by TorchRL's ``check_env_specs``.
 
-    They are reset and take a few random steps: pass others than those of the training.
+    The environments are reset and take a few random steps, so do not pass those of the training.
 
     Args:
         env: The environments.
@@ -54,7 +54,7 @@ def require_specs(env: EnvBase) -> None:
 
 
 def deviations(env: Any) -> Iterator[str]:
-    """Say in what environments deviate from the contract, as far as their specs and members show it.
+    """Yield the deviations of environments from the contract that their specs and members show.
 
     Args:
         env: The environments.

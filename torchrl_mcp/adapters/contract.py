@@ -1,4 +1,4 @@
-"""The contract between environments and all that uses them: TorchRL's ``EnvBase``, and a few members more."""
+"""What training, evaluation and export need of environments: TorchRL's ``EnvBase``, and a few more members."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
@@ -9,14 +9,14 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 TASK_REWARD = "task_reward"
-"""Key of the task's own reward in environments that train with another."""
+"""Key of the task's own reward in environments that train with another reward."""
 
 
 class Reach(NamedTuple):
-    """Two returns with which those of a learner are compared.
+    """Two returns with which the returns of a learner are compared.
 
-    Neither is a bound: who falls earns less than who stands, and an object that is moved to and fro at its target
-    earns a little more than one that rests there.
+    They are not bounds. A player that falls earns less than a player that stands still, and moving an object to and fro
+    at its target earns a little more than leaving it there.
 
     Args:
         standing: Return of a player that stands still without falling, ``(N,)``.
@@ -27,7 +27,7 @@ class Reach(NamedTuple):
     ideal: Tensor
 
     def place(self, returns: Tensor) -> Tensor:
-        """Mean position of returns between the two: 0 for standing still, 1 for the ideal, ``()``."""
+        """Mean position of returns between the two returns, ``()``: 0 for standing still, 1 for the ideal player."""
         standing = self.standing.mean()
         return (returns.mean() - standing) / (self.ideal.mean() - standing)
 
@@ -40,21 +40,21 @@ class Environments(Protocol):
     | ``observation``, ``goal`` | state and goal, floating point | ``(N, S)``, ``(N, G)`` |
     | ``action`` | from -1 to 1 | ``(N, A)`` |
     | ``reward``, ``terminated``, ``truncated``, ``done`` | of the step | ``(N, 1)`` |
-    | ``goal_number`` | optional: which of ``num_goals`` goals it is, for ``method=hierarchical`` | ``(N,)`` |
-    | ``task_reward`` | optional: the task's own reward, if training uses another | ``(N, 1)`` |
+    | ``goal_number`` | optional: number of the goal, below ``num_goals``, for ``method=hierarchical`` | ``(N,)`` |
+    | ``task_reward`` | optional: the task's own reward, if training uses another reward | ``(N, 1)`` |
 
-    The library's characters satisfy it, and :class:`~torchrl_mcp.adapters.adapter.Adapter` adds what other
-    environments lack. :func:`~torchrl_mcp.adapters.check.require_contract` checks it.
+    The environments of this library satisfy this contract, and :class:`~torchrl_mcp.adapters.adapter.Adapter` adds what
+    other environments lack. :func:`~torchrl_mcp.adapters.check.require_contract` checks the contract.
 
     Attributes:
-        max_episode_steps: Most steps of an episode, which then ends as ``truncated``.
+        max_episode_steps: Number of steps after which an episode is ``truncated``.
         control_timestep: Seconds from one action to the next.
         metric_names: Observations that are metrics and not inputs of the policy, ``(N, E)`` by key: flags (bool) or
             numbers, with the names of their entries.
         num_diverged: Number of episodes so far that ended because their simulation diverged.
-        goal_layout: Slices of ``goal`` by name, in order; empty if they have no names.
-        resumes_episodes: Whether ``state_dict`` holds the state of all episodes, so that a resumed run continues them
-            to the same numbers; otherwise it begins new episodes.
+        goal_layout: Slices of ``goal`` by name, in order; empty if the entries have no names.
+        resumes_episodes: Whether ``state_dict`` contains the state of all episodes, so that a resumed run continues
+            them to the same numbers; otherwise it begins new episodes.
     """
 
     max_episode_steps: int
@@ -70,22 +70,22 @@ class Environments(Protocol):
 
     @property
     def physics_seconds(self) -> float:
-        """Wall-clock seconds so far of the simulation, without what surrounds it."""
+        """Wall-clock seconds that the simulation itself has taken so far."""
         ...
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
-        """Undiscounted returns on the scale of reports, where 0 is bad and 1 is good, of the same shape."""
+        """Return undiscounted returns on the scale of reports, where 0 is bad and 1 is good, in the same shape."""
         ...
 
     def reach(self) -> Reach | None:
-        """Returns of standing still and of an ideal player in the episodes just begun, None if unknown."""
+        """Returns of standing still and of an ideal player in the present episodes, or None if they are unknown."""
         ...
 
     def mirrors(self) -> Mapping[str, nn.Module]:
         """Reflections that exchange left and right in ``observation``, ``goal`` and ``action``.
 
         Raises:
-            ValueError: If there are none.
+            ValueError: If the environments have no mirror images.
         """
         ...
 
@@ -112,12 +112,12 @@ class Environments(Protocol):
         ...
 
     def close(self) -> object:
-        """Free what the environments use."""
+        """Release the resources of the environments."""
         ...
 
 
 def task_reward(outcome: TensorDictBase) -> Tensor:
-    """The task's own reward of steps, also if training uses another, ``(*B, 1)``.
+    """The task's own reward of steps, ``(*B, 1)``, even if training uses another reward.
 
     Args:
         outcome: Output of an environment's steps, batch size ``(*B,)``.
