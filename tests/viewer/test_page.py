@@ -3,6 +3,7 @@
 import json
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.runs.policies import restore
 from torchrl_mcp.viewer.page import folder as page_folder
+from torchrl_mcp.viewer.page.clips import write_clips
 from torchrl_mcp.viewer.page.description import require_playable
 from torchrl_mcp.viewer.page.folder import write_page
 from torchrl_mcp.viewer.page.networks import require_same_primitives, stages
@@ -50,7 +52,6 @@ class Wander(Location):
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: player("biped")[1], "imitation"),
         (lambda: Holdout(1, directions=(0.0, 1.0)), "Holdout"),
         (lambda: Wander("biped", 1), "Wander"),
     ],
@@ -64,6 +65,24 @@ def test_a_shape_that_javascript_does_not_draw_is_refused_by_name():
     env.simulation.model.geom_type[-1] = mujoco.mjtGeom.mjGEOM_MESH
     with pytest.raises(ValueError, match="mjGEOM_MESH"):
         require_playable(env)
+
+
+@pytest.mark.parametrize(("character", "loops"), [("biped", False), ("trex", True)])
+def test_clips_are_written_as_the_states_of_bodies_in_each_control_step(character, loops, tmp_path):
+    env = player(character)[1]
+    described = write_clips(env, tmp_path, "clip")
+    assert [clip["name"] for clip in described] == [name.replace("_", " ") for name in env.library.names]
+    rows = np.fromfile(tmp_path / described[1]["clip"]["file"], np.float32).reshape(
+        302, len(env.library.body_names), 13
+    )
+    assert env.library.loops.all() == loops
+    for step in (0, 7, 301):
+        time = torch.tensor([step * env.control_timestep], dtype=torch.float64)
+        bodies = env.library.at(torch.tensor([1]), time).bodies
+        expected = torch.cat([field[0] for field in bodies], -1)
+        np.testing.assert_allclose(rows[step], expected, atol=1e-5)
+    first = env.library.at(torch.tensor([1]), torch.zeros(1, dtype=torch.float64))
+    assert described[1]["clip"]["qpos"] == first.qpos[0].tolist()
 
 
 def test_gates_over_other_primitives_are_refused(walker):

@@ -1,5 +1,6 @@
 """Web pages of policies in a real browser: ``pip install playwright``, and Chromium by ``apt-get install chromium``."""
 
+import json
 import math
 import shutil
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
@@ -15,7 +17,7 @@ pytest.importorskip("onnxscript", reason="needs pip install 'torchrl-mcp[onnx]'"
 from chance import require_share
 from playwright import sync_api as playwright
 
-from torchrl_mcp.envs import Carry, Heading, Location
+from torchrl_mcp.envs import Carry, Heading, Imitation, Location
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.runs.policies import policy_config, restore
 from torchrl_mcp.viewer.page.folder import write_page
@@ -28,7 +30,7 @@ FLAGS = ["--no-sandbox", "--disable-quic", "--use-gl=angle", "--use-angle=swifts
 PATIENCE = 120_000
 """Milliseconds: without a GPU a browser draws a picture in a second."""
 
-NETWORKS = ("humanoid-location", "humanoid-speeds", "trex-dribble", "biped-carry")
+NETWORKS = ("humanoid-location", "humanoid-speeds", "trex-dribble", "biped-carry", "humanoid")
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +41,17 @@ def browser():
         browser.close()
 
 
+FOLLOWING = {"switch_interval": math.inf, "terminate_on_fall": False, "max_error": 1e3, "max_episode_steps": 1000}
+"""Settings of imitation with which an episode follows one clip to its end."""
+
+
 def evaluated(name, num_envs):
     """The policy of a built-in network and environments of its evaluation."""
     path = locate(f"builtin:{name}")
-    settings = OmegaConf.to_container(policy_config(path).evaluation.environment, resolve=True)
+    cfg = policy_config(path)
+    settings = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
+    if cfg.task.name == "imitation":
+        settings |= FOLLOWING
     _, agent, env = restore(path, num_envs=num_envs, seed=7, **settings)
     return agent.actor.policy, env
 
@@ -90,6 +99,9 @@ def remembered(env):
         return {name: float(env.episode[name][0]) for name in ("direction", "speed")}
     if isinstance(env, Location):
         return {"target": env.episode["target"][0].tolist(), "leads": False}
+    if isinstance(env, Imitation):
+        frame = round(float(env.episode["time"][0]) / env.control_timestep)
+        return {"frame": frame, "angle": float(env.episode["turn"][0]), "shift": env.episode["shift"][0].tolist()}
     if isinstance(env, Carry):
         return {"taken": bool(env.episode["taken"][0]), "held": bool(env.simulation.state["eq_active"][0].any())}
     return {}
@@ -101,6 +113,9 @@ def played(name, steps):
     model, simulation = env.simulation.model, env.simulation
     marks = [body for body in range(model.nbody) if model.body_mocapid[body] >= 0]
     states, td = [], env.reset()
+    if isinstance(env, Imitation):  # the first clip, which the page has in steps from its beginning
+        first = env.beginning(torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.float64))
+        td = env.reset(TensorDict(first, [1]), set_state=True)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(steps):
             td = policy(td)
@@ -140,6 +155,38 @@ def test_the_browser_observes_and_acts_as_python_does_in_each_of_its_states(name
             np.abs(np.array(result[key]) - seen[key]) for result, (_, _, seen) in zip(results, states, strict=True)
         ]
         assert np.max(differences) < bound, key
+
+
+FOLLOWED = """
+  const { mujoco, scenes } = simulation;
+  const results = [];
+  const state = () => {
+    const { task, data } = simulation.scene;
+    const [root] = task.frames[task.frame];
+    return { frame: task.frame, place: task.place, heading: task.heading, root, angle: task.angle, shift: task.shift,
+      qpos: Array.from(data.qpos) };
+  };
+  results.push(state());
+  for (let step = 0; step < argument; step++) await simulation.advance();
+  simulation.select(1);
+  results.push(state());
+  return results;
+"""
+
+
+def test_a_clip_begins_in_its_own_state_and_another_goes_on_where_the_character_is(simulated, written):
+    begun, changed = simulated(FOLLOWED, 4 * 20, "humanoid")
+    clip = json.loads((written("humanoid") / "page.json").read_text())["gates"][0]["clip"]
+    assert begun["frame"] == 0
+    assert begun["qpos"] == pytest.approx(clip["qpos"])
+    assert (begun["angle"], *begun["shift"]) == pytest.approx((0, 0, 0), abs=1e-5)
+    for state in (begun, changed):  # where the reference stands after it was moved
+        (x, y, _, w, _, _, z), angle = state["root"][:7], state["angle"]
+        moved = (x + 1j * y) * np.exp(1j * angle) + complex(*state["shift"])
+        assert (moved.real, moved.imag) == pytest.approx(state["place"][:2], abs=1e-5)
+        if state is begun:
+            assert 2 * math.atan2(z, w) + angle == pytest.approx(state["heading"], abs=0.05)
+    assert math.dist(begun["place"], changed["place"]) > 0.1
 
 
 def test_half_precision_changes_no_action_of_a_built_in_network_by_more_than_a_thousandth(simulated):
@@ -248,6 +295,8 @@ def test_a_reader_steers_holds_gates_pushes_and_changes_the_gate_on_a_telephone(
     assert tab.evaluate("page.pace") == 1
 
 
+HIDE = "away => { window.away = away; document.dispatchEvent(new Event('visibilitychange')); }"
+
 SLOWER = """() => {
   const act = page.simulation.act;
   page.simulation.act = function (...seen) {
@@ -263,6 +312,21 @@ def test_a_page_says_that_it_does_not_keep_real_time(visit):
     tab.evaluate(SLOWER)
     slow = "/0\\.\\d+ × real time: this device is too slow/"
     tab.wait_for_function(f"{slow}.test(document.getElementById('status').textContent)")
+
+
+def test_a_page_in_a_hidden_tab_stands_still_and_goes_on_where_it_was(visit):
+    tab = visit("humanoid-location")
+    tab.wait_for_selector("body.ready")
+    tab.wait_for_function("page.simulation.time > 0.1")
+    tab.evaluate("Object.defineProperty(document, 'hidden', { get: () => window.away })")
+    tab.evaluate(HIDE, True)
+    tab.wait_for_timeout(1000)  # what was due when the tab was hidden
+    before = tab.evaluate("page.simulation.time")
+    tab.wait_for_timeout(2000)
+    assert tab.evaluate("page.simulation.time") == before
+    tab.evaluate(HIDE, False)
+    tab.wait_for_function("time => page.simulation.time > time", arg=before)
+    assert tab.evaluate("page.pictures.wanted") < 2.0  # the time away is not due
 
 
 def test_a_browser_without_simd_gets_a_sentence_and_fetches_nothing_large(visit):

@@ -22,7 +22,8 @@ def page(checkpoints: Sequence[Path], folder: Path, *, words: Sequence[str]) -> 
     players: dict[str, Player] = {}
     for path in checkpoints:
         cfg, agent, env = policies.restore(path, num_envs=1, seed=0)
-        name = path.stem.rpartition("-")[2] if path.parent == builtin.FOLDER else cfg.task.name
+        words_of_name = path.stem.split("-")[2:] if path.parent == builtin.FOLDER else []
+        name = words_of_name[0] if words_of_name else cfg.task.name
         players[name if name not in players else f"{name} {len(players) + 1}"] = agent.actor.policy, env
     title = f"{cfg.character.name}: {' or '.join(players)}"
     write_page(players, folder, title=title, command=shlex.join(words))

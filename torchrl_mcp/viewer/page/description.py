@@ -10,7 +10,7 @@ from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.runs.interface import interface
 
-TASKS = (Heading, Location, Carry, Dribble)
+TASKS = (Heading, Location, Carry, Dribble, Imitation)
 """Tasks that ``tasks.js`` has."""
 
 SHAPES = tuple(f"mjGEOM_{shape}" for shape in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
@@ -25,8 +25,6 @@ def require_playable(env: CharacterEnv) -> PDCharacterEnv:
     """
     able = ", ".join(task.__name__.lower() for task in TASKS)
     name = type(env).__name__
-    if isinstance(env, Imitation):
-        raise ValueError(f"the goal of imitation comes from clips, which a page lacks: export a gate for {able}")
     if type(env) not in TASKS or not isinstance(env, PDCharacterEnv):
         raise ValueError(f"the page does not know the task {name}: export a gate for {able}")
     model = env.simulation.model
@@ -50,6 +48,8 @@ def character(env: PDCharacterEnv) -> dict[str, Any]:
 
 def gate(env: PDCharacterEnv) -> dict[str, Any]:
     """Return what the task of a gate shows it, and the range of its speeds in m/s."""
+    if isinstance(env, Imitation):
+        return {"task": "Imitation"}
     described: dict[str, Any] = {"task": type(env).__name__, "goal": list(env.goal_layout), "waypoint": False}
     if isinstance(env, Location):
         return {**described, "speeds": [0.0, env.speed]}

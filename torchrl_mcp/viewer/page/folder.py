@@ -7,11 +7,12 @@ from pathlib import Path
 
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_mcp.envs import CharacterEnv
+from torchrl_mcp.envs import CharacterEnv, Imitation
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.runs.onnx_files import require_onnx
 from torchrl_mcp.training.run_folder import replacing, write_json
 from torchrl_mcp.viewer.page import description
+from torchrl_mcp.viewer.page.clips import write_clips
 from torchrl_mcp.viewer.page.networks import require_same_primitives, stages, write_stage
 from torchrl_mcp.viewer.page.runtimes import NOTICES, runtimes
 from torchrl_mcp.viewer.page.scene import for_browser, require_same_model
@@ -57,7 +58,9 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
             if part == "gate" or index == 0:  # the others are the same for all gates
                 write_stage(stage, state, folder / names[part], half=half)
             stage.evaluate(state)
-        gates.append({"name": name, **files, **description.gate(env)})
+        gate = {"name": name, **files, **description.gate(env)}
+        clips = write_clips(env, folder, f"clip-{index}") if isinstance(env, Imitation) else [{}]
+        gates += [{**gate, **clip} for clip in clips]
     about = {"title": title, "command": command, **description.character(envs[0]), "gates": gates}
     write_json(about, folder / ABOUT)
 

@@ -40,11 +40,11 @@ class Page {
     return this.simulation.scene.task;
   }
 
-  /** Simulate what is due, draw, and wait for the next picture; a hidden page has no pictures and stands still. */
+  /** Simulate what is due, draw, and wait for the next picture; a page in a hidden tab stands still. */
   async frame(now) {
     const seconds = Math.min(Math.max(now - this.last, 0) / 1000, 1); // a picture's time may lie before the last event
     this.last = now;
-    if (!this.paused) await this.simulate(seconds);
+    if (!this.paused && !document.hidden) await this.simulate(seconds);
     this.drawing.draw(this.task.arrows(), seconds);
     this.showWeights();
     this.count(now);
@@ -218,6 +218,7 @@ const HELP = {
   Location: "Click the ground: the character goes there. Or lead it with ← → ↑ ↓; Space stops it.",
   Carry: "Click the ground: the red table moves there, and the character brings the box.",
   Dribble: "Click the ground: the target moves there, and the character brings the ball.",
+  Imitation: "The character follows a motion, whose place the arrow shows. The buttons choose another one.",
 };
 
 const simulation = await open();

@@ -6,6 +6,7 @@ export const ARRIVAL_DISTANCE = 0.3; // rewards.py
 const WALK_AHEAD = 1.5; // seconds; this and what follows: waypoints.py
 const [STRIDE, PUSH, SHARE, BEHIND, ASIDE, STEP] = [1.0, 0.5, 0.1, 0.7, Math.PI / 4, 0.5];
 const [SUCCESS_DISTANCE, SUCCESS_REACH] = [0.5, 2.0]; // rewards.py
+const HORIZON = 0.25; // seconds, imitation_reward.py
 
 /** Horizontal angle of a body's x axis from the world's. */
 export const heading = ([w, x, y, z]) => Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z));
@@ -15,21 +16,14 @@ export const vector = (array, index) => [array[3 * index], array[3 * index + 1],
 
 export const quaternion = (array, index) => Array.from(array.subarray(4 * index, 4 * index + 4));
 
-const turned = ([x, y], angle) => {
+/** A vector in a frame that is turned by an angle. */
+export const turned = ([x, y], angle) => {
   const [cos, sin] = [Math.cos(angle), Math.sin(angle)];
   return [x * cos + y * sin, y * cos - x * sin];
 };
 
-/** Position, orientation, linear and angular velocity of a body, in the frame of an origin and a heading: 13 numbers. */
-export function body_in_heading_frame(angle, origin, model, data, body) {
-  const [vx, vy, vz] = [3, 4, 5].map((axis) => data.cvel[6 * body + axis]);
-  const spin = [0, 1, 2].map((axis) => data.cvel[6 * body + axis]);
-  const place = vector(data.xpos, body);
-  const centre = vector(data.subtree_com, model.body_rootid[body]);
-  const [x, y, z] = place.map((value, axis) => value - centre[axis]);
-  const [a, b, c] = spin; // v = v_c + spin x (place - centre)
-  const velocity = [vx + b * z - c * y, vy + c * x - a * z, vz + a * y - b * x];
-  const [w, i, j, k] = quaternion(data.xquat, body);
+/** Position, orientation, linear and angular velocity in the frame of an origin and a heading: 13 numbers. */
+export function in_heading_frame(angle, origin, place, [w, i, j, k], velocity, spin) {
   const [qw, qz] = turned([w, k], angle / 2);
   const [qx, qy] = turned([i, j], angle / 2);
   const sign = qw < 0 || Object.is(qw, -0) ? -1 : 1;
@@ -38,11 +32,37 @@ export function body_in_heading_frame(angle, origin, model, data, body) {
   return [...seen(offset), sign * qw, sign * qx, sign * qy, sign * qz, ...seen(velocity), ...seen(spin)];
 }
 
+/** The same of a body of the scene. */
+export function body_in_heading_frame(angle, origin, model, data, body) {
+  const [vx, vy, vz] = [3, 4, 5].map((axis) => data.cvel[6 * body + axis]);
+  const spin = [0, 1, 2].map((axis) => data.cvel[6 * body + axis]);
+  const place = vector(data.xpos, body);
+  const centre = vector(data.subtree_com, model.body_rootid[body]);
+  const [x, y, z] = place.map((value, axis) => value - centre[axis]);
+  const [a, b, c] = spin; // v = v_c + spin x (place - centre)
+  const velocity = [vx + b * z - c * y, vy + c * x - a * z, vz + a * y - b * x];
+  return in_heading_frame(angle, origin, place, quaternion(data.xquat, body), velocity, spin);
+}
+
 /** State of a character whose bodies are the first of the scene: its root's height, and what it sees of each body. */
 export function character_state(model, data, num_bodies) {
   const [angle, root] = [heading(quaternion(data.xquat, 1)), vector(data.xpos, 1)];
   const bodies = Array.from({ length: num_bodies }, (_, index) => index + 1);
   return [root[2], ...bodies.flatMap((body) => body_in_heading_frame(angle, root, model, data, body))];
+}
+
+/** Bodies of a frame of a clip as a character sees them at an origin and a heading; a body's row has 13 numbers. */
+export function reference_state(angle, origin, bodies) {
+  return bodies.flatMap((row) => {
+    return in_heading_frame(angle, origin, row.slice(0, 3), row.slice(3, 7), row.slice(7, 10), row.slice(10));
+  });
+}
+
+/** Mismatch of two moments, imitation_reward.py: squared differences of positions and, weighted, of velocities. */
+export function mismatch(one, other) {
+  const differences = one.map((value, index) => (value - other[index]) ** 2);
+  const weights = [1, 1, 1, 0, 0, 0, 0, HORIZON ** 2, HORIZON ** 2, HORIZON ** 2, 0, 0, 0];
+  return differences.reduce((sum, value, index) => sum + weights[index % 13] * value, 0);
 }
 
 /** Positions of the same direction whose distance is logarithmic. */

@@ -27,10 +27,16 @@ export async function open() {
   const mujoco = await loadMujoco({ wasmBinary });
   const [primitives, mixer] = [await session("primitives.onnx"), await session("mixer.onnx")];
   const scenes = [];
-  for (const gate of description.gates) {
-    const model = mujoco.MjModel.from_xml_string(await (await fetched(gate.scene)).text());
+  const compiled = async (name) => {
+    const model = mujoco.MjModel.from_xml_string(await (await fetched(name)).text());
     model.opt.timestep = description.physics_timestep;
-    const scene = { mujoco, model, data: new mujoco.MjData(model), gate, network: await session(gate.network) };
+    return { model, data: new mujoco.MjData(model) };
+  };
+  const known = new Map(); // clips share a scene and a network
+  const once = async (make, name) => known.get(name) ?? known.set(name, await make(name)).get(name);
+  for (const gate of description.gates) {
+    if (gate.clip) gate.clip.rows = new Float32Array(await (await fetched(gate.clip.file)).arrayBuffer());
+    const scene = { mujoco, gate, network: await once(session, gate.network), ...(await once(compiled, gate.scene)) };
     scenes.push({ ...scene, task: new TASKS[gate.task](scene) });
   }
   return new Simulation(description, scenes, primitives, mixer);
@@ -56,6 +62,7 @@ export class Simulation {
   reset() {
     const { model, data, task } = this.scene;
     this.mujoco.mj_resetData(model, data);
+    task.start();
     this.mujoco.mj_forward(model, data);
     task.begin();
     this.refresh();
@@ -64,13 +71,14 @@ export class Simulation {
 
   /** Go on with another gate: the character moves into the gate's scene as it is. */
   select(index) {
-    const before = this.scene;
+    const { num_qpos, num_qvel } = this.description;
+    const qpos = this.scene.data.qpos.slice(0, num_qpos);
+    const qvel = this.scene.data.qvel.slice(0, num_qvel);
     this.scene = this.scenes[index];
     this.reset();
     const { model, data, task } = this.scene;
-    const { num_qpos, num_qvel } = this.description;
-    data.qpos.set(before.data.qpos.subarray(0, num_qpos));
-    data.qvel.set(before.data.qvel.subarray(0, num_qvel));
+    data.qpos.set(qpos);
+    data.qvel.set(qvel);
     this.mujoco.mj_forward(model, data);
     task.begin();
     this.refresh();

@@ -1,14 +1,16 @@
 // What a task remembers between steps, and how a reader steers it: envs/tasks and viewer/steering.py, for one simulation.
 
 import {
-  apart, carry_waypoint, dribble_waypoint, goal_of, heading, logarithmic, place_ahead, place_seen, quaternion, steps,
-  vector, walkable, way,
+  apart, carry_waypoint, character_state, dribble_waypoint, goal_of, heading, logarithmic, mismatch, place_ahead,
+  place_seen, quaternion, reference_state, steps, turned, vector, walkable, way,
 } from "./observations.js";
 
 const TURN = Math.PI / 12; // what a key changes: radians, and m/s
 const SPEED_STEP = 0.25;
 const DAMPING = -Math.log(1 - 0.4); // of the ball, dribble.py
 const [HALF_SIZE, TOP_HALF_SIZE, CLEARANCE, RESTING_GAP] = [0.15, 0.14, 0.1, 0.01]; // metres, tables.py and carry.py
+
+const AHEAD = 60; // steps of a clip that are left at least where it begins
 
 const between = (low, high) => low + (high - low) * Math.random();
 
@@ -38,7 +40,9 @@ class Task {
     return [x + dx, y + dy];
   }
 
+  start() {} // changes the state in which episodes begin
   after_step() {}
+  put() {}
   turn() {}
   walk() {}
   stop() {}
@@ -274,4 +278,61 @@ const columns = (matrices, body) => [0, 1, 2].map((axis) => [0, 3, 6].map((row) 
 
 const dot = (a, b) => a.reduce((sum, value, index) => sum + value * b[index], 0);
 
-export const TASKS = { Heading, Location, Carry, Dribble };
+export class Imitation extends Task {
+  constructor(scene) {
+    super(scene);
+    const { num_bodies, rows } = scene.gate.clip;
+    const body = (index) => Array.from(rows.subarray(13 * index, 13 * index + 13));
+    this.frames = Array.from({ length: rows.length / (13 * num_bodies) }, (_, frame) => {
+      return Array.from({ length: num_bodies }, (_, index) => body(frame * num_bodies + index));
+    });
+  }
+
+  get place() {
+    return vector(this.data.xpos, 1);
+  }
+
+  start() {
+    const { qpos, qvel } = this.gate.clip;
+    this.data.qpos.set(qpos);
+    this.data.qvel.set(qvel);
+  }
+
+  /** Go on at the moment of the clip that is most like the character's state, moved to its place and heading. */
+  begin() {
+    const state = character_state(this.model, this.data, this.gate.clip.num_bodies).slice(1);
+    const mismatches = this.frames.slice(0, Math.max(this.frames.length - AHEAD, 1)).map((bodies) => {
+      const [root] = bodies;
+      return mismatch(state, reference_state(heading(root.slice(3, 7)), root.slice(0, 3), bodies));
+    });
+    this.frame = mismatches.indexOf(Math.min(...mismatches));
+    const [root] = this.frames[this.frame];
+    this.angle = this.heading - heading(root.slice(3, 7));
+    const [x, y] = turned(root, -this.angle);
+    this.shift = [this.place[0] - x, this.place[1] - y];
+  }
+
+  /** A place in the clip, before that was moved. */
+  inverse([x, y]) {
+    return [...turned([x - this.shift[0], y - this.shift[1]], this.angle), 0];
+  }
+
+  goal() {
+    const origin = this.inverse(this.place);
+    const bodies = [this.frames[this.frame + 1], this.frames[this.frame + 2]];
+    return bodies.flatMap((each) => reference_state(this.heading - this.angle, origin, each));
+  }
+
+  after_step() {
+    this.frame += 1;
+    if (this.frame + 3 > this.frames.length) this.begin();
+  }
+
+  arrows() {
+    const [root] = this.frames[this.frame];
+    const [x, y] = turned(root, -this.angle).map((value, axis) => value + this.shift[axis]);
+    return [[[x, y, 2 * root[2]], [x, y, 1.4 * root[2]]]];
+  }
+}
+
+export const TASKS = { Heading, Location, Carry, Dribble, Imitation };
