@@ -28,7 +28,10 @@ from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.web import play_in_browser
 
 CHROMIUM = next(filter(None, map(shutil.which, ["chromium", "chromium-browser", "google-chrome"])), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed: apt-get install chromium")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed: apt-get install chromium"),
+    pytest.mark.slow,  # the viewer runs in real time, beside nothing else
+]
 
 PATIENCE = 90.0
 """Seconds: without a GPU a browser draws a picture in one or more."""
