@@ -348,7 +348,7 @@ WRONG = {
         ["import", "stand.txt", "--bodies", "bodies.yaml"],
         "bodies do not apply to character=humanoid",
     ),
-    "no bodies": (["import", "stand.txt", "--character", "trex", "--bodies", "notes.md"], "notes.md should have lines"),
+    "no bodies": (["import", "stand.txt", "--character", "trex", "--bodies", "notes.md"], "notes.md must have lines"),
     "missing bodies": (["import", "stand.txt", "--bodies", "nowhere.yaml"], "nowhere.yaml"),
     "no module": (
         ["import", "stand.txt", "--module", "nowhere"],
