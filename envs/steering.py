@@ -1,4 +1,4 @@
-"""What a user can set of a task's goal, and what the user sets."""
+"""The goal that a user sets while a policy plays."""
 
 from dataclasses import dataclass
 

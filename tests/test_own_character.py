@@ -155,12 +155,12 @@ def test_files_are_utf_8_in_any_locale(command, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ("--torque knee", "'knee' is not of the form PATTERN=NUMBER, such as ankle=50"),
-        ("--torque knee=-3", "'knee=-3' is not of the form PATTERN=NUMBER"),
-        ("--gain (=5", "'(=5' is not of the form PATTERN=NUMBER"),
-        ("--name on", "'on' is a word of Python or YAML: choose another name"),
-        ("--name class", "'class' is a word of Python or YAML"),
-        ("--sides left", "'left' is not of the form RIGHT:LEFT, such as FR_:FL_"),
+        ("--torque knee", "'knee' must have the form PATTERN=NUMBER, such as ankle=50"),
+        ("--torque knee=-3", "'knee=-3' must have the form PATTERN=NUMBER"),
+        ("--gain (=5", "'(=5' must have the form PATTERN=NUMBER"),
+        ("--name on", "'on' has a meaning in Python or YAML: choose another name"),
+        ("--name class", "'class' has a meaning in Python or YAML"),
+        ("--sides left", "'left' must have the form RIGHT:LEFT, such as FR_:FL_"),
         ("--pose crouch", "--pose crouch is not a keyframe of the file: its keyframes are 0, 1"),
         ("--gain ankle=5", "--gain ankle=5 matches no joint: they are lwaist, pelvis, right_thigh"),
         ("--root head", "the file has no body head for the root: pass one of torso, lwaist"),

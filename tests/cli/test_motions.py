@@ -339,7 +339,7 @@ def test_the_papers_corpus_of_real_files_is_230_seconds_and_half_of_it_is_mirror
 WRONG = {
     "no command": ([], "required: command"),
     "no file": (["import"], "required: FILE"),
-    "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: there is no nowhere.bvh"),
+    "missing file": (["import", "nowhere.bvh"], "torchrl-mcp-motions: there is no file nowhere.bvh"),
     "missing clip": (["inspect", "nowhere.npz"], "torchrl-mcp-motions: .*nowhere.npz"),
     "damaged clip": (["inspect", "broken.npz"], "torchrl-mcp-motions: .*"),
     "unknown kind": (["inspect", "notes.md"], r"notes\.md: must end in \.bvh"),
@@ -348,7 +348,7 @@ WRONG = {
         ["import", "stand.txt", "--bodies", "bodies.yaml"],
         "bodies do not apply to character=humanoid",
     ),
-    "no bodies": (["import", "stand.txt", "--character", "trex", "--bodies", "notes.md"], "notes.md should have lines"),
+    "no bodies": (["import", "stand.txt", "--character", "trex", "--bodies", "notes.md"], "notes.md must have lines"),
     "missing bodies": (["import", "stand.txt", "--bodies", "nowhere.yaml"], "nowhere.yaml"),
     "no module": (
         ["import", "stand.txt", "--module", "nowhere"],
