@@ -141,8 +141,12 @@ def test_others_begin_new_episodes_with_another_seed_which_is_the_same_each_time
         first = env.reset()["observation"]
         resumed = OwnEnvs(Points, 3, seed=0, observation=["place"], max_episode_steps=4)
         resumed.load_state_dict(env.state_dict())
-        starts.append((first, resumed.reset()["observation"]))
+        again = OwnEnvs(Points, 3, seed=0, observation=["place"], max_episode_steps=4)
+        again.load_state_dict(resumed.state_dict())  # as a run that was interrupted twice
+        starts.append((first, resumed.reset()["observation"], again.reset()["observation"]))
     assert not resumed.resumes_episodes
+    assert torch.equal(starts[0][2], starts[1][2])
+    assert not torch.equal(starts[0][2], starts[0][1])
     assert torch.equal(starts[0][1], starts[1][1])
     assert not torch.equal(starts[0][0], starts[0][1])
 

@@ -35,6 +35,32 @@ NETWORKS = "runs/test_places.py::test_folders_of_other_networks_have_other_names
 LONGER = "runs/test_places.py::test_a_longer_run_goes_on_from_another_folder_after_a_move_as_one_that_was_planned"
 
 FAULTS = {
+    # Environments of other libraries
+    "torchrl_mcp/adapters/adapter.py": [
+        (
+            "self._elapsed >= self.max_episode_steps",
+            "self._elapsed > self.max_episode_steps",
+            "adapters/test_adapter.py",
+        ),
+        ("self._elapsed[mask.view(self.num_envs)] = 0", "self._elapsed.zero_()", "adapters/test_adapter.py"),
+        ("(episode_return - worst) / (solved - worst)", "episode_return / solved", "adapters/test_adapter.py"),
+        ('self._elapsed = state_dict["elapsed"].clone()', "pass", "adapters/test_adapter.py"),
+        ('self._starts = int(state_dict["times_begun"]) + 1', "self._starts = 0", "adapters/test_adapter.py"),
+        ("self._env.close(raise_if_closed=False)", "pass", "adapters/test_adapter.py"),
+        ("if len(env.batch_size) != 1", "if False", "adapters/test_adapter.py"),
+        ("if not limit:", "if False:", "adapters/test_adapter.py"),
+    ],
+    "torchrl_mcp/adapters/reading.py": [
+        ("self.half * action.clamp(-1.0, 1.0)", "self.half * action", "adapters/test_adapter.py"),
+        ("if not vectors.isfinite().all()", "if False", "adapters/test_adapter.py"),
+        ("if not spec.dtype.is_floating_point:", "if False:", "adapters/test_adapter.py"),
+        ("if not (high - low).isfinite().all() or not (high > low).all():", "if False:", "adapters/test_adapter.py"),
+        (".argmax(-1)", ".argmin(-1)", "adapters/test_gym.py"),
+    ],
+    "torchrl_mcp/adapters/gym.py": [
+        ("if finals := [name for name in FINAL if name in info]", "if finals := []", "adapters/test_gym.py"),
+        ("isinstance(wrapper, gymnasium.wrappers.Autoreset)", "False", "adapters/test_gym.py"),
+    ],
     # Distributions and networks
     "torchrl_mcp/distributions/multiplicative.py": [
         ("(precisions * loc).sum(-2)", "(precisions * loc).mean(-2)", "distributions/test_multiplicative.py"),
