@@ -202,13 +202,13 @@ def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_ag
     tiny = "preset=smoke training.frames_per_batch=128 task.evaluation.max_episode_steps=10"
     monkeypatch.setattr(search, "EPISODES", "4")
     monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
-    words = ["heading", "scratch", "--minutes", "0.01", "--seeds", "7", "--candidate", f"tiny={tiny}"]
+    words = ["heading", "scratch", "--minutes", "0.05", "--seeds", "7", "--candidate", f"tiny={tiny}"]
     for _ in range(2):
         search.main([*words, "--root", str(tmp_path), "--results", str(tmp_path)])
     with (tmp_path / "heading-scratch-candidates.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["trial"], row["seed"], row["settings"]) == ("tiny", "7", tiny)
-    assert float(row["cpu_seconds"]) >= 0.6
+    assert float(row["cpu_seconds"]) >= 3.0
     assert int(row["steps"]) > 0
     returns = [float(row[f"{mode}_return"]) for mode in ("deterministic", "stochastic")]
     assert float(row["score"]) == pytest.approx(sum(returns) / 2)

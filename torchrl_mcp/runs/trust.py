@@ -61,11 +61,12 @@ def targets(config: Any) -> Iterator[str]:
 
 @cache
 def known() -> frozenset[str]:
-    """Return the classes and functions that the files of ``conf`` name."""
+    """Return the classes and functions that the files of ``conf`` name, without those that they leave to the user."""
     pattern = str(files("torchrl_mcp.conf").joinpath("**/*.yaml"))
     contents = (yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {} for path in glob(pattern, recursive=True))
     settings = ({key: value for key, value in content.items() if key != "hydra"} for content in contents)
-    return frozenset(name for setting in settings for name in targets(setting))
+    names = (name for setting in settings for name in targets(setting))
+    return frozenset(name for name in names if all(map(str.isidentifier, name.split("."))))
 
 
 def require_trusted(config: Mapping[str, Any], source: Path) -> None:
