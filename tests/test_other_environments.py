@@ -72,7 +72,7 @@ def test_a_run_in_environments_that_are_not_saved_is_resumed_with_new_episodes(m
     whole = experiment.train(configure(tmp_path / "whole", f"method={method}", *POINT, *settings))
     folder = killed(whole, tmp_path / "run")
     experiment.resume(folder)
-    assert "begin anew" in capsys.readouterr().out
+    assert "begins new episodes" in capsys.readouterr().out
     assert records.is_complete(folder)
     assert rows(folder)[:-1] == rows(whole)[:-1]
     assert rows(folder)[-1] != rows(whole)[-1]
@@ -84,7 +84,7 @@ def test_a_run_in_environments_that_can_be_saved_is_resumed_to_the_same_numbers(
         whole = experiment.train(configure(tmp_path / "whole", "method=scratch", "checkpoint_interval=1", *own))
         folder = killed(whole, tmp_path / "run")
         experiment.resume(folder)
-        assert "begin anew" not in capsys.readouterr().out
+        assert "begins new episodes" not in capsys.readouterr().out
         assert rows(folder) == rows(whole)
         first, second = final_parts(folder), final_parts(whole)
     assert all(torch.equal(first[name], second[name]) for name in first)

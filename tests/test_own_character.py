@@ -130,7 +130,7 @@ def test_adapting_again_overwrites_nothing_and_says_what_to_do(gymnast, command)
     for name in ("gymnast", "humanoid"):
         arguments = ("humanoid.xml", "--pose", "knee=-0.035", "--name", name)
         done = command("character", "adapt", *arguments, cwd=folder)
-        assert f"{name}.xml is there already: pass another --name or --output" in done.stderr
+        assert f"{name}.xml exists already: pass another --name or --output" in done.stderr
     assert before == {path: path.read_bytes() for path in folder.glob("*.*")}
 
 

@@ -364,7 +364,7 @@ WRONG = {
     "no frames": (["inspect", "stand.txt", "--skip", "-3"], "--skip: '-3' must be a whole number of at least 0"),
     "no Python": (
         ["inspect", "stand.txt", "--module", "broken_code"],
-        r"broken_code, which is no Python: .*broken_code\.py, line 1",
+        r"broken_code, which is not valid Python: .*broken_code\.py, line 1",
     ),
     "same name": (["inspect", "stand.txt", "more/stand.txt"], "two files are called stand"),
     "missing folder": (["build-paper-corpus", "nowhere"], "nowhere lacks"),

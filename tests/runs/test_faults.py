@@ -118,7 +118,7 @@ def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_o
     damage(newest)
     experiment.resume(killed)
     said = capsys.readouterr().out
-    assert f"{newest} is damaged: the run goes on from checkpoint-000000000384.torchrl" in said
+    assert f"{newest} is damaged: the run continues from checkpoint-000000000384.torchrl" in said
     assert newest.with_name(f"{newest.name}.damaged").exists()
     assert rows(killed) == rows(whole)
     expected, parts = (policies.restore(run, num_envs=1, seed=0)[1].parts.state_dict() for run in (whole, killed))

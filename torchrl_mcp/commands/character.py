@@ -183,7 +183,7 @@ def _write(written: dict[Path, str]) -> None:
     """Write files, none of which may be there."""
     for path in written:
         if path.exists():
-            raise ValueError(f"{path} is there already: pass another --name or --output, or remove it")
+            raise ValueError(f"{path} exists already: pass another --name or --output, or remove it")
     for path, text in written.items():
         with replacing(path) as partial:
             partial.write_text(text, encoding="utf-8")

@@ -34,7 +34,7 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     card = output.with_suffix(".md")
     for path in (output, card):
         if path.exists():
-            raise ValueError(f"{path} is there already: remove it, or pass another --output")
+            raise ValueError(f"{path} exists already: remove it, or pass another --output")
     cfg = records.run_config(run)
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)

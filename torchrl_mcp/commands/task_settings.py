@@ -25,7 +25,9 @@ def task_settings(words: list[str]) -> dict[str, Any]:
         raise ValueError(f"--task {' '.join(words)} cannot be read: {' '.join(str(error).split())}") from error
     settings = cast("dict[str, Any]", OmegaConf.to_container(given))
     if unread := [name for name in OWN if name in settings]:
-        raise ValueError(f"--task {unread[0]} would not be read: what the command can change of it is in --help")
+        raise ValueError(
+            f"--task {unread[0]} would have no effect: use the options of this command, which --help lists"
+        )
     if wrong := list(wrong_values(settings)):
         raise ValueError("\n".join(f"--task {line}" for line in wrong))
     return settings

@@ -145,5 +145,5 @@ def _resume(cfg: DictConfig) -> Path:
             f"a resumed run keeps its settings, except for {', '.join(changeable)}: leave out {' '.join(ignored)}"
         )
     if records.is_complete(folder) and total_frames is None:
-        print(f"{folder} is complete: nothing is left to do; training.total_frames=N makes it longer")
+        print(f"{folder} is complete: there is nothing left to do; training.total_frames=N makes it longer")
     return experiment.resume(folder, device=device, total_frames=total_frames, moves=moves)

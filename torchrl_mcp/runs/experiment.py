@@ -88,7 +88,7 @@ def _train_or_resume(plan: Plan, device: str) -> Path:
     if changed := records.changes(folder, plan.config):
         raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
     if is_complete(folder):
-        print(f"{folder} is complete: nothing is left to do", flush=True)
+        print(f"{folder} is complete: there is nothing left to do", flush=True)
     there = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
     return _resume(folder, device, None, there)
 
@@ -131,7 +131,7 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
     records.require_same_character(folder, config)
     cfg.device = device or cfg.device
     require_all(cfg)
-    print(f"{folder} goes on{records.elsewhere(folder, cfg)}", flush=True)
+    print(f"{folder} continues{records.elsewhere(folder, cfg)}", flush=True)
     trainer = _restored(cfg, folder)
     records.store(folder, config)
     (folder / EVALUATION).unlink(missing_ok=True)
@@ -147,12 +147,14 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
         trainer = build.make_run(cfg, folder)
         trainer.restore(path)
         if not trainer.source.resumes_episodes:
-            print("its episodes begin anew, because the state of the environments is not saved", flush=True)
+            print(
+                "the run begins new episodes, because checkpoints do not hold the state of its environments", flush=True
+            )
     else:  # the environments had not been reset yet, so the checkpoint has no state of them
         trainer = build.make_run(cfg, folder, initial_networks(cfg))
         trainer.folder.metrics.rewind(0)
     for damaged in saved[: saved.index(path)]:
-        print(f"{damaged} is damaged: the run goes on from {path.name}, the newest that is intact", flush=True)
+        print(f"{damaged} is damaged: the run continues from {path.name}, the newest intact checkpoint", flush=True)
         checkpoint.set_aside(damaged)
     return trainer
 
@@ -162,7 +164,7 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> Path:
     trainer.folder.metrics.loggers = build.make_loggers(cfg, trainer, folder)
     trainer.run()
     if not (folder / CONFIG).is_file():
-        raise FileNotFoundError(f"{folder} was removed while the run was at work: what it has learnt is lost")
+        raise FileNotFoundError(f"{folder} was removed during the run, so that its results are lost")
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
         write_json(numbers, folder / EVALUATION)

@@ -120,7 +120,7 @@ def _taken(file: IO[str], folder: Path, wait: bool) -> bool:
     file.seek(0)
     who = file.read() or "another process"
     raise ValueError(
-        f"{folder} is in use: {who} is at work on it. Wait until it ends, or stop it, before you continue this run"
+        f"{folder} is in use by {who}: wait until this process ends, or stop it, before you continue the run"
     )
 
 

@@ -106,7 +106,9 @@ def require_same_character(folder: Path, config: Mapping[str, Any]) -> None:
     now, began = (marks.get("character") for marks in (places.digests(config), _origin(folder).get("inputs", {})))
     if None not in (now, began) and now != began:
         name = config["character"]["name"]
-        raise ValueError(f"the file of character={name} was changed since {folder} began: put it back, or train anew")
+        raise ValueError(
+            f"the file of character={name} was changed since {folder} began: put the file back, or start a new run"
+        )
 
 
 def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None:

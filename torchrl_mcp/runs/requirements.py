@@ -43,7 +43,7 @@ def require_all(cfg: DictConfig) -> None:
     require_equipment(cfg)
     for section, given in ((cfg.stage.name, SHARED), ("evaluation", EVALUATED)):
         if unread := [name for name in given if name in (cfg.task.get(section) or ())]:
-            raise ValueError(f"task.{section}.{unread[0]} would not be read: give {given[unread[0]]} instead")
+            raise ValueError(f"task.{section}.{unread[0]} would have no effect: pass {given[unread[0]]} instead")
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
         ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
         raise ValueError(
@@ -261,7 +261,7 @@ def import_own(module: str, origin: str) -> None:
     try:
         import_module(module)
     except SyntaxError as error:
-        raise ValueError(f"{origin} {module}, which is no Python: {error}") from error
+        raise ValueError(f"{origin} {module}, which is not valid Python: {error}") from error
     except ModuleNotFoundError as error:
         if error.name != top:
             _require_own(top, f"{origin} {module}")
