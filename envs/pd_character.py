@@ -157,10 +157,10 @@ class PDCharacterEnv(CharacterEnv):
         self._falling = [as_array(part.to(self.device)) for part in shapes]
         self.observation_layout = state_layout(self._bodies)
         # Live views, made once. Body 0 is the world; the character's bodies come next, and then the task's objects.
-        own = slice(1, 1 + len(self._bodies))
+        bodies = slice(1, 1 + len(self._bodies))
         outputs = self.simulation.outputs
-        self._positions = outputs["xpos"][:, own]
-        self._orientations = outputs["xquat"][:, own]
+        self._positions = outputs["xpos"][:, bodies]
+        self._orientations = outputs["xquat"][:, bodies]
         self.com = outputs["subtree_com"][:, 1]
         self.track(com=self.com)
         self._geom_heights = as_array(outputs["geom_xpos"])[..., 2]

@@ -142,13 +142,13 @@ def adapted(
     drives = _drives(spec.compile(), model, jointed, soles, rest, torques or {}, gains or {})
     for body, name in jointed.items():
         joint = spec.joint(name)
-        own = drives[name]
-        joint.damping[0] = own.passive
-        joint.stiffness[0] = own.spring
-        joint.armature = own.armature
-        joint.frictionloss = own.friction
-        if own.torque_from != PASSIVE:
-            _add_servos(spec, name, own, _ranges(model, body, rest))
+        drive = drives[name]
+        joint.damping[0] = drive.passive
+        joint.stiffness[0] = drive.spring
+        joint.armature = drive.armature
+        joint.frictionloss = drive.friction
+        if drive.torque_from != PASSIVE:
+            _add_servos(spec, name, drive, _ranges(model, body, rest))
     return Adapted(
         spec,
         names[trunk],

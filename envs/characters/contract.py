@@ -185,11 +185,11 @@ def _scenery(model: mujoco.MjModel) -> Iterator[Violation]:
 
 
 def _defaults(spec: mujoco.MjSpec) -> Iterator[Violation]:
-    if own := [
+    if fixed := [
         part.tag for part in ElementTree.fromstring(spec.to_xml()).findall("default/*") if part.tag != "default"
     ]:
         yield Violation(
-            f"has defaults of {', '.join(own)} outside a class, which also change the scenes of tasks",
+            f"has defaults of {', '.join(fixed)} outside a class, which also change the scenes of tasks",
             "put them into a named class, the childclass of the root",
         )
 

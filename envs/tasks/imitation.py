@@ -163,8 +163,8 @@ class Imitation(PDCharacterEnv):
         self._ahead = ahead.unsqueeze(-1).to(self.device)
         self._horizontal = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device=self.device)
         model = self.simulation.model
-        own = slice(1, 1 + len(self._bodies))
-        masses, centres = (torch.from_numpy(field[own]) for field in (model.body_mass, model.body_ipos))
+        bodies = slice(1, 1 + len(self._bodies))
+        masses, centres = (torch.from_numpy(field[bodies]) for field in (model.body_mass, model.body_ipos))
         self._masses = masses.to(self.device)
         self._centres_of_mass = centres.to(self.device)
         self.make_specs()

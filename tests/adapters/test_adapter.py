@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from points import Lasting, Points
+from points import Lasting, Points, play
 from refusals import refused
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
@@ -14,15 +14,6 @@ from torchrl_mcp.adapters.check import require_contract, require_specs
 
 def adapted(env=None, **settings):
     return Adapter(env or Points(), **{"observation": ["place"], "max_episode_steps": 4, **settings})
-
-
-def play(env, actions):
-    """Play actions ``(T, N, 1)``, with resets; return the outcomes."""
-    state, outcomes = env.reset(), []
-    for action in actions:
-        step, state = env.step_and_maybe_reset(state.set("action", action))
-        outcomes.append(step.clone())
-    return torch.stack(outcomes, 1)
 
 
 def test_an_adapted_environment_satisfies_the_contract_and_its_specs():

@@ -4,19 +4,11 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from points import LENGTH, Point
+from points import LENGTH, Point, play
 from refusals import refused
 
 from torchrl_mcp.adapters.check import require_specs
 from torchrl_mcp.adapters.gym import GymnasiumEnvs
-
-
-def play(env, actions):
-    state, outcomes = env.reset(), []
-    for action in actions:
-        step, state = env.step_and_maybe_reset(state.set("action", action))
-        outcomes.append(step.clone())
-    return torch.stack(outcomes, 1)
 
 
 def test_each_environment_gives_gymnasiums_own_episodes_by_its_seed():

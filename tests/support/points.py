@@ -109,3 +109,13 @@ class Widening(Points):
 
     def _step(self, tensordict):
         return super()._step(tensordict).set("far", torch.zeros(*self.batch_size, 2, dtype=torch.bool))
+
+
+def play(env, actions):
+    """Play actions ``(T, N, 1)``, with resets; return the outcomes, ``(N, T)``."""
+    state = env.reset()
+    outcomes = []
+    for action in actions:
+        step, state = env.step_and_maybe_reset(state.set("action", action))
+        outcomes.append(step.clone())
+    return torch.stack(outcomes, 1)

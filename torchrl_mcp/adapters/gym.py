@@ -140,5 +140,5 @@ def _kinds(env: gymnasium.Env, names: Sequence[str], id: str) -> dict[str, torch
     *_, info = env.step(env.action_space.sample())
     if missing := [name for name in names if name not in info or np.ndim(info[name])]:
         numbers = ", ".join(name for name, value in info.items() if not np.ndim(value)) or "nothing"
-        raise ValueError(f"info=[{missing[0]}] is no number of id={id}: after a step, its info has {numbers}")
+        raise ValueError(f"info=[{missing[0]}] must name a number of id={id}: after a step, its info has {numbers}")
     return {name: torch.as_tensor(np.asarray(info[name])).dtype for name in names}

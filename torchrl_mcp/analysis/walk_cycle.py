@@ -56,8 +56,10 @@ def _draw_weights(figure: SubFigure, walk: Walk) -> None:
     palette = colours(num_primitives)
     stance = stance_correlation(walk.gates, walk.standing)
     for number, (axes, colour) in enumerate(zip(grid[:-1].T.flat, palette, strict=False), start=1):
-        own = [row for row in cells if row["primitive"] == number]
-        phase, mean, low, high = (np.array([row[key] for row in own]) for key in ("phase", "mean", "low", "high"))
+        of_primitive = [row for row in cells if row["primitive"] == number]
+        phase, mean, low, high = (
+            np.array([row[key] for row in of_primitive]) for key in ("phase", "mean", "low", "high")
+        )
         axes.broken_barh(_spans(alone), (-0.04, 1.08), color=SHADE, linewidth=0)
         axes.fill_between(phase, low, high, color=colour, alpha=0.25, linewidth=0)
         axes.plot(phase, mean, color=colour, linewidth=1.8)

@@ -139,8 +139,8 @@ class Section:
     def is_best(self, cell: Cell, mode: str) -> bool:
         """Whether a cell has the highest of at least two means."""
         means = [fmean(returns) for row in self.rows if (returns := row.cell.returns(mode))]
-        own = cell.returns(mode)
-        return bool(own) and len(means) > 1 and fmean(own) == max(means)
+        cell_returns = cell.returns(mode)
+        return bool(cell_returns) and len(means) > 1 and fmean(cell_returns) == max(means)
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,11 @@ def publish(
         shared: Fingerprints of the parts to leave out, by name, because the built-in networks hold them.
     """
     shared = dict(shared or {})
-    own = copy.deepcopy(nn.ModuleDict({name: part for name, part in parts.items() if name not in shared}))
-    for parameter in own.parameters():
+    published = copy.deepcopy(nn.ModuleDict({name: part for name, part in parts.items() if name not in shared}))
+    for parameter in published.parameters():
         parameter.data = parameter.data.to(torch.bfloat16)
     path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoint.run_checkpoint(own).save(path, metadata={"config": config, "shared": shared})
+    checkpoint.run_checkpoint(published).save(path, metadata={"config": config, "shared": shared})
 
 
 def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> dict[str, str]:
@@ -48,15 +48,15 @@ def fingerprints(parts: nn.ModuleDict, names: Collection[str], origin: Path) -> 
     Raises:
         ValueError: If a part differs, or the file does not hold it.
     """
-    held = nn.ModuleDict({name: copy.deepcopy(parts[name]) for name in names})
-    checkpoint.load_parts(held, names, origin)
-    own = {name: fingerprint(_rounded(parts[name])) for name in names}
-    if differing := [name for name in names if fingerprint(held[name]) != own[name]]:
+    rounded = nn.ModuleDict({name: copy.deepcopy(parts[name]) for name in names})
+    checkpoint.load_parts(rounded, names, origin)
+    marks = {name: fingerprint(_rounded(parts[name])) for name in names}
+    if differing := [name for name in names if fingerprint(rounded[name]) != marks[name]]:
         raise ValueError(
             f"the policy was trained over other {' and '.join(differing)} than {origin.name} holds, which come with "
             "the library: train it again with pretrained=builtin"
         )
-    return own
+    return marks
 
 
 def _rounded(part: nn.Module) -> nn.Module:

@@ -100,11 +100,11 @@ def widen_goal(wide: nn.Module, narrow: nn.Module, entry: slice) -> None:
         if tensor.shape == source.shape:
             tensor.copy_(source)
             continue
-        own = source.shape[-1] - (entry.stop - entry.start)
+        before = source.shape[-1] - (entry.stop - entry.start)
         if tensor.ndim > 1:
             tensor.zero_()
-        tensor[..., :own] = source[..., :own]
-        tensor[..., own + entry.start : own + entry.stop] = source[..., own:]
+        tensor[..., :before] = source[..., :before]
+        tensor[..., before + entry.start : before + entry.stop] = source[..., before:]
 
 
 def fingerprint(module: nn.Module) -> str:
