@@ -407,7 +407,11 @@ FAULTS = {
     ],
     "torchrl_mcp/training/episodes.py": [("            self.returns[done] = 0\n", "", "training/test_episodes.py")],
     "torchrl_mcp/training/transfer.py": [
-        ("[..., before + entry.start : before + entry.stop]", "[..., entry.start : entry.stop]", "training/test_transfer.py"),
+        (
+            "[..., before + entry.start : before + entry.stop]",
+            "[..., entry.start : entry.stop]",
+            "training/test_transfer.py",
+        ),
         ("if normaliser not in freeze", "if False", "training/test_transfer.py"),
     ],
     "torchrl_mcp/training/collectors.py": [
