@@ -212,7 +212,7 @@ def test_its_run_is_evaluated_again_to_the_same_numbers(run, again, tmp_path):
 def test_its_run_resumes_to_the_same_numbers(run, again):
     before = rows(run), json.loads((run / "evaluation.json").read_text())
     checkpoint.find(run).unlink()
-    assert "goes on" in again("train", f"resume={run}")
+    assert "continues" in again("train", f"resume={run}")
     assert (rows(run), json.loads((run / "evaluation.json").read_text())) == before
 
 

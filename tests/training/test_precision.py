@@ -112,7 +112,7 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
     with pytest.warns(UserWarning, match=r"5\.0 times as long") if chosen else nullcontext():
         experiment.resume(folder)
     said = capsys.readouterr().out
-    assert "goes on on Another (cpu)" in said
+    assert "continues on Another (cpu)" in said
     assert f"with networks in {word} as it began" in said
     assert set(seen) == {chosen}
 
