@@ -40,7 +40,7 @@ demo: $(STAMP)
 	$(BIN)/torchrl-mcp-demo
 
 test: $(STAMP)
-	$(PYTEST) -n 2 --dist loadfile -m "not slow"
+	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 # The tests whose outcome is chaotic, as on processors that are not at hand: half an hour.
 PERTURBATIONS ?= 20
@@ -52,7 +52,7 @@ test-faults: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/support/faults.py
 
 test-slow: $(STAMP)
-	$(PYTEST) -n 2 --dist loadfile -m slow
+	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 # An environment of its own, without the pins.
 test-latest:
@@ -60,7 +60,7 @@ test-latest:
 	$(LATEST)/bin/python -m pip install --quiet torch setuptools wheel
 	$(LATEST)/bin/python -m pip install --quiet --no-build-isolation -e '.[dev,warp]'
 	$(LATEST)/bin/python -m pip freeze --exclude-editable
-	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 --dist loadfile -m "not slow"
+	OMP_NUM_THREADS=1 $(LATEST)/bin/pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 # Doctests leave out what imports an extra that need not be there.
 check: $(STAMP)

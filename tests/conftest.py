@@ -43,6 +43,18 @@ def pytest_configure(config):
     torch.set_num_threads(config.getoption("threads"))
 
 
+LONGEST = (
+    *("test_page_browser.py", "test_collectors.py", "test_benchmarks.py", "test_workers.py", "test_ray_workers.py"),
+    *("test_demo.py", "test_failures.py", "test_table_2.py", "test_simulation.py", "test_camera.py"),
+)
+"""Files whose tests start processes, and last longest."""
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the longest files, so that at the end no worker waits long for the last file of another."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 def pytest_generate_tests(metafunc):
     """Repeat tests of trajectories as on as many other processors as asked for."""
     repetitions = metafunc.config.getoption("perturbations")

@@ -198,7 +198,10 @@ def search(monkeypatch):
     return importlib.import_module("search")
 
 
-def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_again(search, tmp_path, monkeypatch):
+def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_again(
+    search, command, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(search.subprocess, "run", lambda words, **_: command("evaluate", *words[1:]))  # no new process
     tiny = "preset=smoke training.frames_per_batch=128 task.evaluation.max_episode_steps=10"
     monkeypatch.setattr(search, "EPISODES", "4")
     monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
