@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from torchrl_mcp.cli import motions
-from torchrl_mcp.commands import motions as motion_files
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.capture import paper_corpus
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk
@@ -171,6 +171,13 @@ def test_a_clip_reaches_a_character_of_a_module_with_the_bodies_that_are_printed
     assert "follows" not in run("inspect", "clips/walk.npz", "--module", "lizard")[1]
 
 
+def test_without_a_human_body_there_is_no_table_of_strides(run):
+    trex_walk(1.0, 0.0).save("trex.npz")
+    status, output, errors = run("inspect", "trex.npz", "--strides")
+    assert (status, errors) == (0, "")
+    assert output.splitlines()[-1].startswith("no strides: ")
+
+
 def test_inspect_shows_the_strides_of_people_if_asked_to(run):
     stride("humanoid", 1.0, 0.0, strides=8).save("walk.npz")
     stride("biped", 0.8, 0.5, strides=8).save("turn.npz")
@@ -296,7 +303,7 @@ def test_what_was_assumed_about_the_vertical_is_said(run, tmp_path):
 def corpus(folder, **seconds):
     """The files of the paper's corpus, in which nobody moves a limb."""
     (folder / "deep").mkdir(parents=True)
-    for name, duration in {**motion_files.PAPER_CORPUS, **seconds}.items():
+    for name, duration in {**paper_corpus.DURATIONS, **seconds}.items():
         if name.endswith(".txt"):
             loop = "wrap" if name == "humanoid3d_walk.txt" else "none"
             (folder / "deep" / name).write_text(motion(duration, loop, speed=0.1))

@@ -1,86 +1,24 @@
 """Importing, inspecting and drawing motion files, and rebuilding the paper's corpus."""
 
 import argparse
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from zipfile import BadZipFile
 
-from torch import Tensor
-
 from torchrl_mcp.envs.motions.archive import Archive
-from torchrl_mcp.envs.motions.capture.fit import Import
+from torchrl_mcp.envs.motions.capture.fit import MIRRORED, Import
 from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
 from torchrl_mcp.envs.motions.capture.key_bodies import read_key_map
+from torchrl_mcp.envs.motions.capture.paper_corpus import paper_corpus
 from torchrl_mcp.envs.motions.errors import MotionFormatError
-from torchrl_mcp.envs.motions.inspection.feasibility import feasibility
 from torchrl_mcp.envs.motions.inspection.pictures import contact_sheet, save_film, save_picture
-from torchrl_mcp.envs.motions.inspection.statistics import GaitStatistics, gait_statistics
-from torchrl_mcp.envs.motions.inspection.summary import Summary, summarised
+from torchrl_mcp.envs.motions.inspection.tables import clip_table, stride_table
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import replacing
 
-PAPER_CORPUS = {
-    "humanoid3d_long_walk1.txt": 32.79,
-    "humanoid3d_long_walk2.txt": 24.56,
-    "humanoid3d_long_walk3.txt": 17.74,
-    "0005_Walking001.bvh": 39.09,
-    "humanoid3d_walk.txt": 1.27,
-}
-"""Seconds of each file. With mirror images of all but the last, which loops, they add up to appendix C's 230 s."""
-
-SOURCES = {
-    ".txt": "https://github.com/xbpeng/DeepMimic, data/motions",
-    ".bvh": "https://mocap.cs.sfu.ca, subject 0005, Walking001",
-}
-
-COLUMNS = (
-    "clip",
-    "character",
-    "seconds",
-    "frames/s",
-    "m/s",
-    "|rad/s|",
-    "slide m/s",
-    "standing soles",
-    "cut to limits",
-    "beyond limits",
-    "below ground",
-    "legs in legs",
-    "torque/limit",
-    "rest pose leans",
-)
-"""Columns of the table, from ``summary`` and ``feasibility`` of ``torchrl_mcp.envs.motions.inspection``."""
-
-STRIDES: dict[str, Callable[[GaitStatistics], Tensor]] = {
-    "length m": lambda strides: strides.stride_length,
-    "steps/min": lambda strides: strides.cadence,
-    "width m": lambda strides: strides.step_width,
-    "stance": lambda strides: strides.stance,
-    "double support": lambda strides: strides.double_support,
-    "bob m": lambda strides: strides.bob,
-    "sway m": lambda strides: strides.sway,
-    "knee swing deg": lambda strides: strides.knee_swing,
-    "foot strikes deg": lambda strides: strides.pitch_strike,
-    "arm swing deg": lambda strides: strides.arm_swing,
-}
-"""Columns of the table of strides, which shows medians."""
-
-MIRRORED = "_mirrored"
-"""End of the names of mirror images."""
-
 Failures = dict[Path, Exception]
 """Errors by the files that could not be read."""
-
-SLIDING = 0.2
-"""Speed in m/s that sliding feet exceed if a motion is read incorrectly, and do not reach if it is read correctly."""
-
-GLIDING = 0.7
-"""The same for the slowest of the lowest points of the body."""
-
-CAUSES = "unit, frame rate, map or order of rotations"
-"""Settings that make feet slide if they are wrong."""
 
 
 def import_files(arguments: argparse.Namespace) -> None:
@@ -95,7 +33,7 @@ def import_files(arguments: argparse.Namespace) -> None:
     for name, motion in _read(arguments, failed):
         made = {name: motion}
         if arguments.mirror:
-            made[f"{name}{MIRRORED}"] = motion._replace(clip=motion.clip.mirrored())
+            made[f"{name}{MIRRORED}"] = motion.mirrored()
         _save(made, arguments.output)
         written |= made
     if written:
@@ -128,20 +66,7 @@ def render_files(arguments: argparse.Namespace) -> None:
 
 def build_paper_corpus(arguments: argparse.Namespace) -> None:
     """Write the clips of the paper's corpus, from files that the user has downloaded."""
-    paths = {name: sorted(arguments.folder.rglob(name))[:1] for name in PAPER_CORPUS}
-    if missing := [name for name, found in paths.items() if not found]:
-        lines = "".join(f"\n  {name} (from {SOURCES[Path(name).suffix]})" for name in missing)
-        raise ValueError(f"{arguments.folder} lacks{lines}\nDownload them into it, and mind their terms of use.")
-    motions = {}
-    for name, [path] in paths.items():
-        motion = imported(path, arguments.character or HUMANS[0], rate=arguments.rate)
-        clip = motion.clip
-        if abs(clip.duration - PAPER_CORPUS[name]) > 0.1:
-            expected = f"{path} lasts {clip.duration:.2f} s, and the paper's corpus needs {PAPER_CORPUS[name]:.2f} s"
-            raise ValueError(f"{expected}: it is another file, or was changed; download it again")
-        motions[path.stem] = motion
-        if not clip.loop:
-            motions[f"{path.stem}{MIRRORED}"] = motion._replace(clip=clip.mirrored())
+    motions = paper_corpus(arguments.folder, arguments.character or HUMANS[0], rate=arguments.rate)
     _require_no_recordings(motions, arguments.output)
     _save(motions, arguments.output)
     print(f"{_table(motions)}\nwritten to {arguments.output}")
@@ -223,70 +148,15 @@ def _save(motions: Mapping[str, Import], folder: Path) -> None:
 
 
 def _table(motions: Mapping[str, Import]) -> str:
-    """Return a line for each clip, with a warning about clips whose feet slide."""
-    summaries = {name: summarised(motion.clip) for name, motion in motions.items()}
-    rows = [_row(name, motion, summaries[name]) for name, motion in motions.items()]
-    total = f"{sum(numbers.duration for numbers in summaries.values()):.1f}"
-    rows.append(("total", "", total, *[""] * (len(COLUMNS) - 3)))
-    lines = text_table([dict(zip(COLUMNS, row, strict=True)) for row in rows])
-    for name, motion in motions.items():
-        if motion.bodies:
-            often, most = (float(motion.missed.quantile(share)) for share in (0.5, 1.0))
-            lines += (
-                f"\nBones miss their directions in {name} by {often:.1f} deg in the median, {most:.1f} deg at most."
-            )
-    for character, bodies in {motion.clip.character: motion.bodies for motion in motions.values()}.items():
-        if bodies:
-            pairs = ", ".join(f"{part}: {body}" for part, body in bodies.items())
-            lines += f"\n{character} follows with {pairs}. If this is wrong, give a file of such lines (--bodies)."
-    for name, motion in motions.items():
-        if motion.assumed:
-            lines += f"\nAssumed for {name}: {motion.assumed}. If this is wrong, say which axis points up (--up) "
-            lines += "or which frame stands (--rest-frame)."
-    for note in dict.fromkeys(motion.ground for motion in motions.values() if motion.ground):
-        names = ", ".join(name for name, motion in motions.items() if motion.ground == note)
-        lines += f"\nIn {names}, {note}."
-    if sliding := [name for name, numbers in summaries.items() if numbers.slide > SLIDING]:
-        lines += f"\nThe feet slide in {', '.join(sliding)}: {CAUSES} may be wrong."
-    if gliding := [name for name, numbers in summaries.items() if numbers.gliding > GLIDING and name not in sliding]:
-        lines += f"\nNo part of the body rests on the ground in {', '.join(gliding)}: {CAUSES} may be wrong."
-    return lines
-
-
-def _row(name: str, motion: Import, numbers: Summary) -> tuple[str, ...]:
-    clip, rest_lean, cut, *_ = motion
-    demand = feasibility(clip)
-    return (
-        name,
-        clip.character,
-        f"{numbers.duration:.2f}",
-        f"{clip.fps:.4g}{' loop' if clip.loop else ''}",
-        f"{numbers.speed:.2f}",
-        f"{numbers.turn_rate:.2f}",
-        "-" if math.isnan(numbers.slide) else f"{numbers.slide:.3f}",
-        "-" if math.isnan(numbers.sole) else f"{round(100 * numbers.sole, 1) + 0.0:.1f} cm",
-        f"{float(cut.max()):.1f} deg, {100 * float((cut > 1).double().mean()):.0f} %" if len(cut) else "-",
-        f"{math.degrees(demand.limit):.1f} deg",
-        f"{100 * demand.penetration:.1f} cm",
-        f"{100 * demand.crossing:.1f} cm",
-        f"{demand.torque:.2f}",
-        "-" if math.isnan(rest_lean) else f"{rest_lean:.1f} deg",
-    )
+    """Return a table of clips, and the remarks on them below."""
+    rows, remarks = clip_table(motions)
+    return "\n".join([text_table(rows), *remarks])
 
 
 def _strides(motions: Mapping[str, Import]) -> str:
-    """Return a line of medians over the complete strides of each clip of a human body."""
-    rows = []
-    for name, (clip, *_) in motions.items():
-        if clip.character in HUMANS:
-            strides = gait_statistics(clip)
-            medians = [
-                float(measure(strides).quantile(0.5)) if len(strides.speed) else math.nan
-                for measure in STRIDES.values()
-            ]
-            cells = ("-" if math.isnan(median) else f"{median:.3g}" for median in medians)
-            rows.append({"clip": name, "strides": str(len(strides.speed)), **dict(zip(STRIDES, cells, strict=True))})
-    return text_table(rows)
+    """Return a table of the strides of human bodies."""
+    rows = stride_table(motions)
+    return text_table(rows) if rows else f"no strides: only those of {' and '.join(HUMANS)} are measured"
 
 
 def _joint_map(pairs: list[str]) -> dict[str, str] | None:
