@@ -2,7 +2,7 @@
 
 import argparse
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import tensordict  # noqa: F401 - before mujoco, see envs/__init__.py
 import mujoco
 
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.characters.adapt import Adapted, adapted, float_trunk, key_bodies
+from torchrl_mcp.envs.characters.adapt import Adapted, adapted, key_bodies
 from torchrl_mcp.envs.characters.contract import Violation, guessed_feet, passive_bodies, violations
 from torchrl_mcp.envs.characters.drives import GUESSED, PASSIVE, Drive
+from torchrl_mcp.envs.characters.files import parse_body, read_body
 from torchrl_mcp.envs.characters.sides import SIDES, Sides, guessed_sides
 from torchrl_mcp.runs.tables import text_table
 from torchrl_mcp.training.run_folder import replacing
@@ -49,7 +50,7 @@ GRAVITY = 9.81
 
 def check(arguments: argparse.Namespace) -> int:
     """Print each violation of the contract; return the exit status."""
-    spec = _spec(mujoco.MjSpec.from_file, str(arguments.file), arguments.file)
+    spec = read_body(arguments.file)
     model = spec.compile()
     sides = _sides(model, arguments.sides)
     feet = arguments.feet or guessed_feet(model, sides)
@@ -70,9 +71,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     """
     name = arguments.name
     folder = arguments.output
-    source = _spec(
-        mujoco.MjSpec.from_file, str(arguments.file), arguments.file, arguments.floating, arguments.root
-    ).compile()
+    source = read_body(arguments.file, floating=arguments.floating, trunk=arguments.root).compile()
     body = adapted(
         source,
         root=arguments.root,
@@ -85,7 +84,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     body.spec.modelname = name
     body.spec.compile()
     text = body.spec.to_xml()
-    written = _spec(mujoco.MjSpec.from_string, text, f"what was made of {arguments.file}")
+    written = parse_body(text, f"what was made of {arguments.file}")
     model = written.compile()
     ends = tuple(key_bodies(model))
     _require_unused(name, folder)
@@ -156,27 +155,6 @@ def _row(name: str, drive: Drive, limits: tuple[float, float]) -> dict[str, str]
         "armature kg m2": f"{drive.armature:.3g}",
         "": ", ".join([*(f"{key} {value:.3g}" for key, value in kept.items() if value), *filter(None, [drive.remark])]),
     }
-
-
-def _spec(
-    read: Callable[[str], mujoco.MjSpec], source: str, what: object, floating: bool = False, trunk: str | None = None
-) -> mujoco.MjSpec:
-    """Read MJCF or a URDF from a file or a text, give its trunk a free joint if it is ``floating``, and compile it.
-
-    Raises:
-        ValueError: If MuJoCo cannot.
-    """
-    try:
-        spec = read(source)
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {what}: {error}") from error
-    if floating:
-        float_trunk(spec, trunk)
-    try:
-        spec.compile()
-    except ValueError as error:
-        raise ValueError(f"MuJoCo cannot read {what}: {error}") from error
-    return spec
 
 
 def _write(written: dict[Path, str]) -> None:

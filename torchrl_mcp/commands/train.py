@@ -53,7 +53,7 @@ def train(cfg: DictConfig) -> float | None:
     announce(PROGRAM)
     in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     with _interruptible() if in_sweep else _explained(cfg):
-        from torchrl_mcp.commands.summary import final_return, summary
+        from torchrl_mcp.report.summary import final_return, summary
         from torchrl_mcp.runs import experiment
 
         begin = experiment.train_or_resume if in_sweep else experiment.train
