@@ -8,8 +8,8 @@ from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 
 import torchrl_mcp.conf
-from torchrl_mcp.cli.train import main
 from torchrl_mcp.commands.suggestions import suggestions
+from torchrl_mcp.commands.train import main
 from torchrl_mcp.runs import benchmark
 
 CONF = Path(torchrl_mcp.conf.__file__).parent
@@ -41,8 +41,7 @@ def test_every_choice_of_every_group_composes(choices):
 )
 def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, curriculum, mixture):
     arguments = [f"task={task}", f"curriculum={curriculum}", "stage=transfer", "--cfg", "job", "--resolve"]
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
-    main()
+    main(arguments)
     printed = yaml.safe_load(capsys.readouterr().out)
     assert len((printed["curriculum"]["aids"] or {}).get("mixture", [])) == mixture
     assert (
@@ -52,8 +51,7 @@ def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypat
 
 @pytest.mark.parametrize("words", [["--cfg", "hydra"], ["-c", "hydra"], ["--cfg=hydra"]])
 def test_hydras_own_settings_can_be_printed_with_all_references_resolved(monkeypatch, capsys, words):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "run_root=elsewhere", "--resolve", *words])
-    main()
+    main(["run_root=elsewhere", "--resolve", *words])
     printed = yaml.safe_load(capsys.readouterr().out)
     assert printed["sweep"]["dir"] == "elsewhere/multirun"
     assert "method" not in printed
@@ -158,7 +156,7 @@ def test_options_may_follow_settings_and_a_damaged_file_is_named(command, tmp_pa
 
 
 def test_without_assertions_the_remedy_is_said(tmp_path):
-    words = [sys.executable, "-O", "-m", "torchrl_mcp.cli.train", "--multirun", "seed=range(0,2)"]
+    words = [sys.executable, "-O", "-m", "torchrl_mcp.commands.train", "--multirun", "seed=range(0,2)"]
     outcome = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert outcome.returncode
     assert outcome.stderr.splitlines()[-1].endswith("unset PYTHONOPTIMIZE, or drop -O")
@@ -175,9 +173,8 @@ def test_without_assertions_the_remedy_is_said(tmp_path):
     ],
 )
 def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, capsys, arguments, answer):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
     with pytest.raises(SystemExit) as stop:
-        main()
+        main(arguments)
     assert stop.value.code
     said = capsys.readouterr().err + str(stop.value.code)
     assert answer in said
@@ -190,7 +187,6 @@ def test_a_benchmark_of_your_own_is_found(monkeypatch, tmp_path):
     planned = []
     monkeypatch.setattr(benchmark, "launch", lambda jobs, launcher: planned.extend(jobs) or jobs)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "--config-dir", "own", "benchmark=mine"])
     with pytest.raises(SystemExit, match="scratch"):  # what was planned has not been done
-        main()
+        main(["--config-dir", "own", "benchmark=mine"])
     assert [(job.config["method"]["name"], job.config["seed"]) for job in planned] == [("scratch", 4)]

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchrl_mcp.cli import motions
+from torchrl_mcp.commands import motions
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions.capture import paper_corpus
 from torchrl_mcp.envs.motions.clip import MotionClip
@@ -33,10 +33,9 @@ def run(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", ["torchrl-mcp-motions", *map(str, words)])
         status, error = 0, ""
         try:
-            motions.main()
+            motions.main([*map(str, words)])
         except SystemExit as end:
             status, error = (1, f"{end.code}\n") if isinstance(end.code, str) else (end.code, "")
         captured = capsys.readouterr()
@@ -397,7 +396,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
 
 
 def test_help_shows_examples():
-    command = [sys.executable, "-m", "torchrl_mcp.cli.motions", "--help"]
+    command = [sys.executable, "-m", "torchrl_mcp.commands.motions", "--help"]
     result = subprocess.run(command, capture_output=True, text=True, cwd="/")
     assert result.returncode == 0
     for name in ("import", "inspect", "render", "build-paper-corpus"):
