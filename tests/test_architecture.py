@@ -138,6 +138,15 @@ def test_hydra_is_imported_at_the_door_alone_and_without_its_internals():
     assert not [other for name in using for other in IMPORTS[name] if "._" in other]
 
 
+def test_only_training_changes_the_command_line_of_the_process():
+    changing = set()
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del):
+                changing |= {name} if ast.unparse(node).startswith("sys.argv") else set()
+    assert changing == {"torchrl_mcp.commands.train"}  # because hydra.main reads nothing else
+
+
 OF_EXTRAS = {"torchrl_mcp.envs.physics.warp"} if find_spec("mujoco_warp") is None else set()
 """What imports an extra that is not there."""
 

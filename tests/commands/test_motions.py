@@ -55,7 +55,7 @@ def test_import_replaces_no_recording(run, tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
     for words in (["walk.txt"], ["walk.txt", "--output", "own"], ["clip.npz"], ["clip.txt", "--mirror"]):
         status, _, errors = run("import", *words)
-        assert "is a recording that the clip would replace: give another --output" in f"{status}{errors}"
+        assert "is a recording that the clip would replace: pass another --output" in f"{status}{errors}"
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.npz")} == before
 
 
@@ -362,7 +362,7 @@ WRONG = {
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: pass it \(--fps\)"),
-    "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
+    "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map: 'left_knee' must have the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
     "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' must be a duration: pass more than 0 seconds"),

@@ -179,8 +179,8 @@ def adapt(arguments: argparse.Namespace) -> int:
     """Convert a file into a character, and write it with its module and its configuration.
 
     Raises:
-        ValueError: If MuJoCo cannot read the file or what was made of it, a file to write is there already, or the name
-            is of another character or module.
+        ValueError: If MuJoCo cannot read the file or the converted body, a file to write exists already, or another
+            character or module has the name.
     """
     from torchrl_mcp.envs.characters.adapt import adapted, key_bodies
     from torchrl_mcp.envs.characters.contract import violations
@@ -201,7 +201,7 @@ def adapt(arguments: argparse.Namespace) -> int:
     body.spec.modelname = name
     body.spec.compile()
     text = body.spec.to_xml()
-    written = parse_body(text, f"what was made of {arguments.file}")
+    written = parse_body(text, f"the converted {arguments.file}")
     model = written.compile()
     ends = tuple(key_bodies(model))
     _require_unused(name, folder)
@@ -227,28 +227,39 @@ def adapt(arguments: argparse.Namespace) -> int:
 
 
 def _require_unused(name: str, folder: Path) -> None:
-    """Check that a new name is of no character and no module, which would be imported instead."""
+    """Check that no character of the library and no other module has the name.
+
+    Raises:
+        ValueError: If one has. Python would import the other module instead of the character's.
+    """
     from torchrl_mcp.envs.characters import CHARACTERS
 
-    known = {"ant", *(name for name, character in CHARACTERS.items() if character.file is None)}
-    module = find_spec(name)
-    if not (folder / f"{name}.xml").exists() and (name in known or (module and module.origin)):
-        owner = "a character of the library" if name in known else f"a Python module, {module and module.origin}"
-        raise ValueError(f"{name} is the name of {owner}: choose another (--name)")
+    if (folder / f"{name}.xml").exists():
+        return  # the name is that of the character to write, which _write refuses to replace
+    if name in {"ant", *(name for name, character in CHARACTERS.items() if character.file is None)}:
+        raise ValueError(f"{name} is the name of a character of the library: choose another (--name)")
+    if (module := find_spec(name)) and module.origin:
+        raise ValueError(f"{name} is the name of a Python module, {module.origin}: choose another (--name)")
 
 
 def _description(body: "Adapted", gravity: float, arguments: argparse.Namespace) -> Iterator[str]:
-    """Yield what was found and chosen, and tables of the joints and of what is left out."""
+    """Yield lines about the choices that were made, and tables of the joints and of the omitted parts.
+
+    Args:
+        body: The converted body.
+        gravity: Greatest component of the acceleration of free fall in the file.
+        arguments: The command line.
+    """
     from torchrl_mcp.envs.characters.drives import GUESSED, PASSIVE
     from torchrl_mcp.runs.tables import text_table
 
-    yield f"root: {body.root}{'' if arguments.root else ' (guessed: give another with --root)'}"
+    yield f"root: {body.root}{'' if arguments.root else ' (guessed: pass another with --root)'}"
     yield f"pose: {' '.join(arguments.pose) or 'as in the file'}"
-    yield f"feet: {', '.join(body.feet)}{'' if arguments.feet else ' (guessed: name others with --feet)'}"
+    yield f"feet: {', '.join(body.feet)}{'' if arguments.feet else ' (guessed: pass others with --feet)'}"
     sides = " ".join(f"{right}:{left}" for right, left in body.sides) or "none found"
-    yield f"sides: {sides}{'' if arguments.sides else ' (guessed: give others with --sides)'}"
+    yield f"sides: {sides}{'' if arguments.sides else ' (guessed: pass others with --sides)'}"
     if gravity and abs(gravity / GRAVITY - 1) > 0.1:
-        yield f"units: gravity is {gravity:.4g} in the file, so its lengths are not in metres; they are taken as metres"
+        yield f"units: gravity is {gravity:.4g} in the file, so its lengths are not in metres; they are read as metres"
     yield ""
     yield text_table([_row(name, drive, body.ranges[name]) for name, drive in body.drives.items()])
     if body.left_out:
@@ -259,10 +270,10 @@ def _description(body: "Adapted", gravity: float, arguments: argparse.Namespace)
         ]
         yield text_table(rows)
     if passive := [name for name, drive in body.drives.items() if drive.torque_from == PASSIVE]:
-        yield f"{', '.join(passive)} stay passive: no actuator of the file acts on them, and --torque gives them one"
+        yield f"{', '.join(passive)} stay passive, because no actuator of the file acts on them: --torque adds one"
     guesses = sum([drive.torque_from, drive.gain_from].count(GUESSED) for drive in body.drives.values())
     if guesses:
-        yield f"{guesses} values are guessed from the weights: give those of the maker with --torque and --gain"
+        yield f"{guesses} values are guessed from the weights: pass the maker's values with --torque and --gain"
 
 
 def _row(name: str, drive: "Drive", limits: tuple[float, float]) -> dict[str, str]:

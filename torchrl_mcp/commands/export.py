@@ -23,7 +23,7 @@ examples:
 
 @entry_point(PROGRAM)
 def main(words: list[str]) -> None:
-    """Write the policy, and print its difference from torch, or the page's size."""
+    """Write the policy, and print how far the ONNX file differs from torch, and the size of the page."""
     options = parser()
     arguments = options.parse_args(words)
     if arguments.onnx is None and arguments.torch is None and arguments.page is None:
@@ -80,7 +80,7 @@ def write_page(checkpoints: Sequence[Path], folder: Path, *, command: str) -> st
         command: The command that makes the page.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or the page cannot play it.
+        ValueError: If a checkpoint is missing or damaged, or the page cannot play it.
     """
     from torchrl_mcp.runs import policies
     from torchrl_mcp.viewer.page import folder as pages

@@ -103,7 +103,7 @@ def holdout(arguments: argparse.Namespace) -> None:
     for path in arguments.checkpoints:
         cfg = policies.policy_config(path)
         if cfg.task.name != "holdout":
-            raise ValueError(f"{path} is of task={cfg.task.name}: Figure 5 is of task=holdout, give runs of that task")
+            raise ValueError(f"{path} is of task={cfg.task.name}: pass runs of task=holdout, which Figure 5 shows")
         runs.setdefault(_label(cfg), {}).setdefault(cfg.stage.name, []).append(path)
     for label, stages in runs.items():
         panels: dict[str, Trajectories] = {}
@@ -144,7 +144,7 @@ def explore(arguments: argparse.Namespace) -> None:
 
 
 def _explored(arguments: argparse.Namespace) -> tuple[dict[str, "Exploration"], str]:
-    """Explorations by name, of every checkpoint and of noise, and the name of the character."""
+    """Return the explorations of every checkpoint and of noise by name, and the name of the character."""
     import torch
 
     from torchrl_mcp.analysis import checkpoints, exploration
@@ -152,16 +152,16 @@ def _explored(arguments: argparse.Namespace) -> tuple[dict[str, "Exploration"], 
 
     runs = [(name, *policies.restore(path, num_envs=1, seed=0)[:2]) for name, path in _named(arguments.checkpoints)]
     first = runs[0][1]
-    if others := {cfg.character.name for _, cfg, _ in runs} - {first.character.name}:
-        given = f"{first.character.name} and {', '.join(others)}"
-        raise ValueError(f"checkpoints are of {given}: give those of one character")
-    num = arguments.trajectories
+    characters = dict.fromkeys(cfg.character.name for _, cfg, _ in runs)
+    if len(characters) > 1:
+        raise ValueError(f"the checkpoints are of {' and '.join(characters)}: pass checkpoints of one character")
+    number = arguments.trajectories
     seed = arguments.seed
     std = first.get("action_std", first.character.action_std)
-    env, start = checkpoints.ground(first, num, seconds=arguments.seconds, seed=seed)
+    env, start = checkpoints.ground(first, number, seconds=arguments.seconds, seed=seed)
     panels: dict[str, Exploration] = {}
     for name, cfg, agent in runs:
-        explorer = checkpoints.explorer(cfg, agent, num, torch.Generator().manual_seed(seed))
+        explorer = checkpoints.explorer(cfg, agent, number, torch.Generator().manual_seed(seed))
         label = checkpoints.explorer_title(cfg)
         label = f"{label} ({name})" if label in panels else label
         panels[label] = exploration.explore(explorer, agent.parts["observation_normaliser"], env, start)
@@ -215,20 +215,20 @@ def _ray_rows(name: str, panel: "Trajectories") -> list[dict[str, object]]:
 
 
 def _cells(folders: Sequence[Path]) -> "list[Cell]":
-    """Cells of run folders, as in the report."""
+    """Return the cells of run folders, as in the report."""
     from torchrl_mcp.report.comparison import cells
     from torchrl_mcp.report.results import Run, read_run
 
     runs = []
     for folder in folders:
         if not isinstance(run := read_run(folder), Run):
-            raise ValueError(f"{folder}: {run.reason}; give run folders, which have learning curves")
+            raise ValueError(f"{folder}: {run.reason}; pass run folders, which have learning curves")
         runs.append(run)
     return cells(runs)
 
 
 def _label(cfg: "DictConfig") -> str:
-    """Title of a method, with its mixer and exploration if they are not standard."""
+    """Return the title of a method, with its mixer and exploration if they are not standard."""
     details = []
     if cfg.method.standard.get("mixer") not in (None, cfg.mixer.name):
         details.append(cfg.mixer.name)
@@ -240,13 +240,13 @@ def _label(cfg: "DictConfig") -> str:
 
 
 def _named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Paths with names for files: the shortest ends of the paths that are unique."""
-    whole = [path.resolve().with_suffix("") if path.is_file() else path.resolve() for path in paths]
-    for depth in range(1, max(len(path.parts) for path in whole) + 1):
-        names = ["-".join(path.parts[-depth:]) for path in whole]
+    """Return paths with names for files: the shortest ends of the paths that are unique."""
+    stems = [path.resolve().with_suffix("") if path.is_file() else path.resolve() for path in paths]
+    for depth in range(1, max(len(stem.parts) for stem in stems) + 1):
+        names = ["-".join(stem.parts[-depth:]) for stem in stems]
         if len(set(names)) == len(names):
             return list(zip(names, paths, strict=True))
-    raise ValueError("a checkpoint is named twice: give each once")
+    raise ValueError("the command line names a checkpoint twice: pass each once")
 
 
 def _save(figure: "Figure", stem: Path) -> None:

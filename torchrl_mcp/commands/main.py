@@ -28,14 +28,14 @@ COMMANDS = {
 @entry_point(PROGRAM)
 def main(words: list[str]) -> None:
     """Run the command that the first word names, with the other words."""
-    name, *others = words or ["--help"]
+    name, *arguments = words or ["--help"]
     if name.startswith("-"):
         parser().parse_args([name])
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         nearest = f"the nearest is {near[0]}" if near else f"choose from {', '.join(COMMANDS)}"
         sys.exit(f"{PROGRAM}: there is no command {name}: {nearest}")
-    import_module(f"torchrl_mcp.commands.{name}").main(others)
+    import_module(f"torchrl_mcp.commands.{name}").main(arguments)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -78,7 +78,12 @@ def parser() -> argparse.ArgumentParser:
         "--scale", type=float, help="metres per unit of length (default: fits the length of the character's legs)"
     )
     source.add_argument(
-        "--map", action="append", default=[], metavar="PART=JOINT", help="joint that is a part of the body; repeatable"
+        "--map",
+        type=_part,
+        action="append",
+        default=[],
+        metavar="PART=JOINT",
+        help="joint that is a part of the body; repeatable",
     )
     source.add_argument("--skip", type=index, metavar="N", help="leave out the first N frames, for example a T-pose")
     source.add_argument(
@@ -102,7 +107,10 @@ def parser() -> argparse.ArgumentParser:
         "--quaternion", choices=("wxyz", "xyzw"), help="order of quaternions in files of joint rotations"
     )
     source.add_argument(
-        "--joints", metavar="NAME,NAME,...", help="joints in the order of the columns of files of states"
+        "--joints",
+        type=_names,
+        metavar="NAME,NAME,...",
+        help="joints in the order of the columns of files of states",
     )
 
     command = commands.add_parser("import", parents=[source, target], help="convert motion capture into clips (.npz)")
@@ -133,6 +141,17 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _part(text: str) -> tuple[str, str]:
+    part, separator, joint = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r} must have the form PART=JOINT, such as left_knee=LKnee")
+    return part.strip(), joint.strip()
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
 def import_files(arguments: argparse.Namespace) -> None:
     """Write a clip for each file as soon as it is read, and its mirror image if requested."""
     from torchrl_mcp.envs.motions.capture.fit import MIRRORED
@@ -145,11 +164,11 @@ def import_files(arguments: argparse.Namespace) -> None:
     written: dict[str, Import] = {}
     failed: Failures = {}
     for name, motion in _read(arguments, failed):
-        made = {name: motion}
+        clips = {name: motion}
         if arguments.mirror:
-            made[f"{name}{MIRRORED}"] = motion.mirrored()
-        _save(made, arguments.output)
-        written |= made
+            clips[f"{name}{MIRRORED}"] = motion.mirrored()
+        _save(clips, arguments.output)
+        written |= clips
     if written:
         print(f"{_table(written)}\nwritten to {arguments.output}")
     _raise(failed, len(arguments.files))
@@ -193,7 +212,7 @@ def build_paper_corpus(arguments: argparse.Namespace) -> None:
 
 
 def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str, "Import"]]:
-    """Yield the motion of each file, with its name without suffix, and put errors of the others into ``failed``."""
+    """Yield the name of each file without its suffix, and its motion; put the errors of other files into ``failed``."""
     from torchrl_mcp.envs.motions.archive import Archive
     from torchrl_mcp.envs.motions.capture.importer import imported
     from torchrl_mcp.envs.motions.capture.joint_motion import HUMANS
@@ -201,8 +220,7 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
 
     for path in arguments.files:
         if sum(path.stem == other.stem for other in arguments.files) > 1:
-            raise ValueError(f"two files are called {path.stem}: rename one, or call the program for each")
-    joint_map = _joint_map(arguments.map)
+            raise ValueError(f"two files are called {path.stem}: rename one, or run the command once for each")
     bodies = read_key_map(arguments.bodies) if arguments.bodies else None
     for path in arguments.files:
         try:
@@ -214,14 +232,14 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
                 rate=arguments.rate,
                 fps=arguments.fps,
                 scale=arguments.scale,
-                joint_map=joint_map,
+                joint_map=dict(arguments.map) or None,
                 skip=arguments.skip,
                 rest_frame=arguments.rest_frame,
                 up=arguments.up,
                 asf=arguments.asf,
                 body_model=arguments.body_model,
                 quaternion=arguments.quaternion,
-                joints=[name.strip() for name in arguments.joints.split(",")] if arguments.joints else None,
+                joints=arguments.joints,
                 bodies=bodies,
             )
         except (BadZipFile, ImportError, OSError, RuntimeError, ValueError) as error:
@@ -231,10 +249,10 @@ def _read(arguments: argparse.Namespace, failed: Failures) -> Iterator[tuple[str
 
 
 def _raise(failed: Failures, number: int) -> None:
-    """Raise an error that names each file that could not be read, if there are any.
+    """Raise an error that names all files that could not be read, if there are any.
 
     Args:
-        failed: The errors of these files.
+        failed: Errors of the files that could not be read.
         number: Number of all files.
     """
     messages: dict[str, list[str]] = {}
@@ -248,14 +266,19 @@ def _raise(failed: Failures, number: int) -> None:
 
 
 def _require_no_recordings(names: Iterable[str], folder: Path, recordings: Sequence[Path] = ()) -> None:
-    """Check that clips replace no recording: none of ``recordings``, and no other file that is no clip.
+    """Check that clips replace only clips.
+
+    Args:
+        names: Names of the clips to write.
+        folder: The folder to write to.
+        recordings: Files to keep, even if they are clips.
 
     Raises:
-        ValueError: If one would.
+        ValueError: If a clip would replace another file.
     """
     for path in filter(Path.exists, (folder / f"{name}.npz" for name in names)):
         if any(map(path.samefile, recordings)) or not _is_clip(path):
-            raise ValueError(f"{path} is a recording that the clip would replace: give another --output")
+            raise ValueError(f"{path} is a recording that the clip would replace: pass another --output")
 
 
 def _is_clip(path: Path) -> bool:
@@ -292,13 +315,6 @@ def _strides(motions: Mapping[str, "Import"]) -> str:
 
     rows = stride_table(motions)
     return text_table(rows) if rows else f"no strides: only those of {' and '.join(HUMANS)} are measured"
-
-
-def _joint_map(pairs: list[str]) -> dict[str, str] | None:
-    """Parse ``PART=JOINT``."""
-    if wrong := [pair for pair in pairs if "=" not in pair]:
-        raise ValueError(f"--map {wrong[0]} is not of the form PART=JOINT, such as left_knee=LKnee")
-    return {part.strip(): joint.strip() for part, _, joint in (pair.partition("=") for pair in pairs)} or None
 
 
 if __name__ == "__main__":

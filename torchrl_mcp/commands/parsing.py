@@ -176,7 +176,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
     """Return the modules that a command line trusts, and the command line without them."""
     trusted = []
-    others = []
+    kept = []
     rest = iter(words)
     for word in rest:
         if word == "--trust":
@@ -184,8 +184,8 @@ def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
         elif word.startswith("--trust="):
             trusted.append(own_module(word.removeprefix("--trust=")))
         else:
-            others.append(word)
-    return trusted, others
+            kept.append(word)
+    return trusted, kept
 
 
 def add_task(parser: argparse.ArgumentParser) -> None:
@@ -203,7 +203,7 @@ def add_task(parser: argparse.ArgumentParser) -> None:
 
 
 def task_settings(words: list[str]) -> dict[str, Any]:
-    """Return the values that ``--task KEY=VALUE`` gives, by key; dots lead into an argument's own.
+    """Return the values of ``--task KEY=VALUE`` by key; a dot in a key leads to an entry of an argument.
 
     Raises:
         ValueError: If a word cannot be read, has no value or a wrong one, or names an argument that the command passes.
@@ -216,10 +216,10 @@ def task_settings(words: list[str]) -> dict[str, Any]:
     if valueless := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {valueless[0]} has no value: write --task {valueless[0]}=VALUE")
     try:
-        given = OmegaConf.from_dotlist(words)
+        config = OmegaConf.from_dotlist(words)
     except (OmegaConfBaseException, LookupError) as error:
         raise ValueError(f"--task {' '.join(words)} cannot be read: {' '.join(str(error).split())}") from error
-    settings = cast("dict[str, Any]", OmegaConf.to_container(given))
+    settings = cast("dict[str, Any]", OmegaConf.to_container(config))
     if unread := [name for name in RESERVED if name in settings]:
         raise ValueError(
             f"--task {unread[0]} would have no effect: use the options of this command, which --help lists"

@@ -75,7 +75,7 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
         limits: Sentences about the policy's limits.
 
     Raises:
-        ValueError: If the folder holds no run, its policy cannot be published, or a file would be overwritten.
+        ValueError: If the folder holds no run, the policy cannot be published, or a file exists already.
     """
     card = output.with_suffix(".md")
     for path in (output, card):

@@ -31,53 +31,16 @@ end_with_parent_while_starting()  # before the imports that take a worker second
 
 PROGRAM = "torchrl-mcp-train"
 
-GROUPS = {
-    **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
-    "task": "imitation is for pre-training; holdout, gymnasium and torchrl for both stages; all others for transfer",
-    "character": "the ant does holdout only, none is for gymnasium and torchrl, and all others do all other tasks",
-    "stage": "transfer needs pretrained=, except for the method scratch",
-    "preset": "fast learns best; paper has the values of Tables 5 to 11; comparison gives all methods equal steps",
-    "benchmark": "many runs, of several methods",
-    "exploration": "action samples the composite action, weights samples the gate; MCP uses weights at transfer",
-    "curriculum": "none trains with the episodes of the evaluation, mixed also with easier ones",
-    "motions": "reference motions of imitation",
-    "imitation": "reward of imitation",
-    "physics": "engine of training episodes; warp runs on a GPU, and needs device=cuda and torchrl-mcp[warp]",
-    **dict.fromkeys(("collector", "optimizer"), ""),
-    "logger": "where metrics go, beside metrics.csv",
-}
-"""Groups of settings for the command line and what they say; the choices of other groups come with a method."""
-
-SETTINGS = {
-    "run_dir=FOLDER": "run folder (default: in run_root, named after the settings)",
-    "seed=N": "seed of networks, environments and sampling",
-    "pretrained=FOLDER": "run folder to transfer from, or builtin for networks that come with the library",
-    "resume=FOLDER": "run folder to continue; device= and training.total_frames=N may change",
-    "training.total_frames=N": "environment steps",
-    "width=FACTOR": "width of hidden layers, as a share of the paper's",
-    "device=cuda": "train networks on a GPU; for physics on the GPU, add physics=warp",
-}
-
 VALUED = (
     *("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path", "-c", "--cfg", "-p", "--package"),
     *("-i", "--info", "--experimental-rerun"),
 )
-"""Options whose value is the next word."""
-
-EXAMPLES = f"""\
-examples:
-  {PROGRAM} method=scratch task=heading character=biped
-  {PROGRAM} method=mcp task=heading character=humanoid stage=transfer pretrained=builtin
-  {PROGRAM} --multirun method=scratch task=holdout stage=transfer seed=0,1,2
-  {PROGRAM} --multirun method=scratch task=heading seed=0,1 hydra/launcher=joblib hydra.launcher.n_jobs=2
-  {PROGRAM} benchmark=smoke
-  {PROGRAM} task=heading method=scratch --cfg job        # every setting and its value
-"""
+"""Options of Hydra whose value is the next word."""
 
 
 @entry_point(PROGRAM)
 def main(words: list[str]) -> None:
-    """Run the command line; if Hydra cannot compose it, say what to write instead."""
+    """Run the command line; if Hydra cannot compose it, print what to write instead."""
     trusted, words = take_trust(words)
     if answered := {"--help", "-h", "--version"} & set(words):
         parser().parse_args(sorted(answered))
@@ -226,7 +189,7 @@ def _explained(cfg: "DictConfig") -> Iterator[None]:
 
 
 def _place(error: "HydraException") -> str:
-    """Return the last line of code, outside of installed packages, of the error that Hydra tells of."""
+    """Return the last line of code outside of installed packages at which an error of Hydra was raised."""
     frames = traceback.extract_tb(error.__cause__.__traceback__) if error.__cause__ else []
     outside = [frame for frame in frames if "site-packages" not in frame.filename]
     return f" ({outside[-1].filename}, line {outside[-1].lineno})" if outside else ""
@@ -242,7 +205,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def _what_is_safe(cfg: "DictConfig") -> str:
-    """Return a sentence on the saved state of a failed run, and how to continue."""
+    """Return a sentence about the saved state of a failed run and how to continue."""
     folder = Path(cfg.resume or cfg.run_dir)
     if not (folder / CONFIG).is_file():
         return "No run has begun: fix the cause and repeat the command"
@@ -251,8 +214,55 @@ def _what_is_safe(cfg: "DictConfig") -> str:
     return f"The run is safe up to its last checkpoint in {folder}: go on with {resuming(folder)}"
 
 
+GROUPS = {
+    **dict.fromkeys(("method", "mixer", "gating", "primitives"), ""),
+    "task": "imitation is for pre-training; holdout, gymnasium and torchrl for both stages; all others for transfer",
+    "character": "the ant does holdout only, none is for gymnasium and torchrl, and all others do all other tasks",
+    "stage": "transfer needs pretrained=, except for the method scratch",
+    "preset": "fast learns best; paper has the values of Tables 5 to 11; comparison gives all methods equal steps",
+    "benchmark": "many runs, of several methods",
+    "exploration": "action samples the composite action, weights samples the gate; MCP uses weights at transfer",
+    "curriculum": "none trains with the episodes of the evaluation, mixed also with easier ones",
+    "motions": "reference motions of imitation",
+    "imitation": "reward of imitation",
+    "physics": "engine of training episodes; warp runs on a GPU, and needs device=cuda and torchrl-mcp[warp]",
+    **dict.fromkeys(("collector", "optimizer"), ""),
+    "logger": "where metrics go, beside metrics.csv",
+}
+"""Meaning of the groups of settings that a user chooses; a method chooses the other groups."""
+
+SETTINGS = {
+    "run_dir=FOLDER": "run folder (default: in run_root, named after the settings)",
+    "seed=N": "seed of networks, environments and sampling",
+    "pretrained=FOLDER": "run folder to transfer from, or builtin for networks that come with the library",
+    "resume=FOLDER": "run folder to continue; device= and training.total_frames=N may change",
+    "training.total_frames=N": "environment steps",
+    "width=FACTOR": "width of hidden layers, as a share of the paper's",
+    "device=cuda": "train networks on a GPU; for physics on the GPU, add physics=warp",
+}
+
+SWEEPS = """\
+sweeps:
+  --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. The same command again skips
+  complete runs, continues unfinished runs, and repeats failed ones.
+  hydra/launcher=joblib, submitit_local: several runs at a time (pip install 'torchrl-mcp[launchers]')
+  hydra/launcher=slurm: runs on a cluster (the same)
+  hydra/launcher=ray_local, ray: runs by Ray (pip install 'torchrl-mcp[ray-launcher]')
+  hydra/sweeper=optuna: search for the best return (pip install 'torchrl-mcp[optuna]')"""
+
+EXAMPLES = f"""\
+examples:
+  {PROGRAM} method=scratch task=heading character=biped
+  {PROGRAM} method=mcp task=heading character=humanoid stage=transfer pretrained=builtin
+  {PROGRAM} --multirun method=scratch task=holdout stage=transfer seed=0,1,2
+  {PROGRAM} --multirun method=scratch task=heading seed=0,1 hydra/launcher=joblib hydra.launcher.n_jobs=2
+  {PROGRAM} benchmark=smoke
+  {PROGRAM} task=heading method=scratch --cfg job        # every setting and its value
+"""
+
+
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of ``--help``. Hydra parses all else, but its import is too slow for ``--help``."""
+    """Return the parser of ``--help``. Hydra parses everything else, but its import is too slow for ``--help``."""
     parser = new_parser(
         PROGRAM, "Train a method on a task, as a single run, a Hydra multirun or a benchmark.", _epilog()
     )
@@ -277,16 +287,6 @@ def parser() -> argparse.ArgumentParser:
     add_trust(parser)
     parser.add_argument("--hydra-help", action="store_true", help="print Hydra's own options")
     return parser
-
-
-SWEEPS = """\
-sweeps:
-  --multirun trains with every combination of values: seed=0,1,2 or 'seed=range(0,3)'. The same command again skips
-  complete runs, continues unfinished runs, and repeats failed ones.
-  hydra/launcher=joblib, submitit_local: several runs at a time (pip install 'torchrl-mcp[launchers]')
-  hydra/launcher=slurm: runs on a cluster (the same)
-  hydra/launcher=ray_local, ray: runs by Ray (pip install 'torchrl-mcp[ray-launcher]')
-  hydra/sweeper=optuna: search for the best return (pip install 'torchrl-mcp[optuna]')"""
 
 
 def _epilog() -> str:
