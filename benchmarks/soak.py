@@ -47,7 +47,7 @@ from torchrl_mcp.training import checkpoint, run_folder
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BATCH = 512
-TRAIN = [sys.executable, "-m", "torchrl_mcp.cli.train"]
+TRAIN = [sys.executable, "-m", "torchrl_mcp.commands.train"]
 SETTINGS = (
     *SMALL,
     *("logger=csv", "progress_bar=false", "num_threads=1", "torch_threads=1", "checkpoint_interval=5"),

@@ -152,7 +152,7 @@ def command():
         with pytest.MonkeyPatch.context() as patch, chdir(cwd), redirect_stdout(output), redirect_stderr(errors):
             patch.setattr(sys, "argv", words)
             patch.setattr(HydraConfig.instance(), "cfg", None)
-            code = _exit_code(import_module(f"torchrl_mcp.cli.{name}").main)
+            code = _exit_code(import_module(f"torchrl_mcp.commands.{name}").main)
         torch.set_num_threads(threads)
         return CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 

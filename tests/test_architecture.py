@@ -22,7 +22,6 @@ ORDER = (
     {"analysis"},
     {"report", "viewer"},
     {"commands"},
-    {"cli"},
 )
 """Folders of ``torchrl_mcp``, of which each may import those before it."""
 CONTRACT = "torchrl_mcp.adapters.contract"
@@ -43,7 +42,7 @@ ROOMS = (
 """Folders and modules of ``torchrl_mcp.envs``, of which each may import those before it."""
 ROOM_RANKS = {room: rank for rank, rooms in enumerate(ROOMS) for room in rooms}
 HYDRA = {f"torchrl_mcp.runs.{name}" for name in ("configuration", "provenance", "build", "benchmark")}
-"""Modules beside those of ``cli`` and ``commands`` that may import Hydra: composing, building, launching."""
+"""Modules beside those of ``commands`` that may import Hydra: composing, building, launching."""
 WITHOUT_HYDRA = {folder for folders in ORDER[:7] for folder in folders} | {"analysis", "viewer", "envs"}
 RESTORING = {"torchrl_mcp.analysis.checkpoints"}
 """Modules of theirs that restore runs, by way of ``runs.build``."""
@@ -135,8 +134,17 @@ def test_no_modules_import_one_another_in_a_circle():
 
 def test_hydra_is_imported_at_the_door_alone_and_without_its_internals():
     using = {name for name in MODULES if any(other.split(".")[0] == "hydra" for other in IMPORTS[name])}
-    assert {name for name in using if folder(name) not in ("cli", "commands")} == HYDRA
+    assert {name for name in using if folder(name) != "commands"} == HYDRA
     assert not [other for name in using for other in IMPORTS[name] if "._" in other]
+
+
+def test_only_training_changes_the_command_line_of_the_process():
+    changing = set()
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del):
+                changing |= {name} if ast.unparse(node).startswith("sys.argv") else set()
+    assert changing == {"torchrl_mcp.commands.train"}  # because hydra.main reads nothing else
 
 
 OF_EXTRAS = {"torchrl_mcp.envs.physics.warp"} if find_spec("mujoco_warp") is None else set()

@@ -211,7 +211,7 @@ def test_every_module_has_its_place_in_the_reference():
     pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
     documented = set(re.findall(r"automodule:: (\S+)", pages))
     for name in modules():
-        if name.startswith(("torchrl_mcp.cli", "torchrl_mcp.commands")):
+        if name.startswith("torchrl_mcp.commands"):
             continue  # commands have a page of their own
         packages = [importlib.import_module(package) for package in accumulate(name.split(".")[:-1], "{}.{}".format)]
         exports = (getattr(package, export) for package in packages for export in getattr(package, "__all__", ()))
@@ -242,6 +242,6 @@ def test_the_page_of_commands_has_every_option_of_every_command(monkeypatch):
     for name, module in (("export", "--onnx FILE"), ("motions import", "--mirror"), ("play", "--viewer {web,window}")):
         _, _, section = page.partition(f"torchrl-mcp-{name}\n")
         assert f"`{module}`" in section.partition("\n## ")[0]
-    for module in sorted((PACKAGES["torchrl_mcp"] / "cli").glob("*.py")):
+    for module in sorted((PACKAGES["torchrl_mcp"] / "commands").glob("*.py")):
         for option in re.findall(r'add_argument\(\s*"(?:-\w+", ")?(--[\w-]+)"', module.read_text()):
             assert option == "--version" or option in page, option

@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-from torchrl_mcp.cli import character, motions, play, train
+from torchrl_mcp.commands import character, motions, play, train
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.motions import MotionClip
 from torchrl_mcp.envs.rendering import opengl

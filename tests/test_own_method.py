@@ -11,7 +11,7 @@ import pytest
 from refusals import refused
 
 import torchrl_mcp
-from torchrl_mcp.cli import evaluate, figures, report, train
+from torchrl_mcp.commands import evaluate, figures, report, train
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.trust import trusting
 

@@ -139,7 +139,7 @@ def test_a_clone_uses_its_own_folders_while_another_is_installed(clones):
     code = (
         f"import runpy, site, sys; site.addsitedir({str(site)!r})\n"
         "sys.argv = ['train', '--cfg', 'job', 'preset=smoke', 'task=heading', 'method=scratch']\n"
-        "runpy.run_module('torchrl_mcp.cli.train', run_name='__main__')\n"
+        "runpy.run_module('torchrl_mcp.commands.train', run_name='__main__')\n"
         "import torchrl_mcp.envs\n"
         "print(*[m.__file__ for n, m in sys.modules.items() if n.startswith('torchrl_mcp')])"
     )
@@ -167,7 +167,7 @@ def test_a_module_of_the_users_comes_before_a_folder_of_the_clone(name, tmp_path
     (tmp_path / f"{name}.py").write_text("MINE = True")
     code = (
         f"import sys; sys.path.remove(''); sys.path.append({str(ROOT)!r})\n"
-        "from torchrl_mcp.cli import parsing; parsing.find_own_modules()\n"
+        "from torchrl_mcp.commands import parsing; parsing.find_own_modules()\n"
         f"import {name}; print({name}.MINE)"
     )
     done = run_code(code, cwd=tmp_path)

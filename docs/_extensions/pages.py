@@ -53,7 +53,7 @@ def written(command: list[str], folder: Path) -> bool:
     if same and about.stat().st_mtime > newest:
         return True
     folder.parent.mkdir(parents=True, exist_ok=True)
-    export = [sys.executable, "-m", "torchrl_mcp.cli.export", *command[1:]]
+    export = [sys.executable, "-m", "torchrl_mcp.commands.export", *command[1:]]
     done = subprocess.run(export, cwd=folder.parent, capture_output=True, text=True)
     if done.returncode:
         LOGGER.info("no page %s: %s", folder.name, done.stderr.strip().splitlines()[-1])

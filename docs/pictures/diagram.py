@@ -97,10 +97,10 @@ def architecture() -> str:
         "From a command over the configuration to environments, agent and objective, which the loop trains",
         780,
         470,
-        box(8, 8, 200, 64, "input", "command", "cli/train.py, conf/*.yaml"),
+        box(8, 8, 230, 64, "input", "command", "commands/train.py, conf/*.yaml"),
         box(290, 8, 200, 64, "input", "plan and checks", "runs/experiment.py"),
         box(572, 8, 200, 64, "input", "builder", "runs/build.py"),
-        arrow((208, 40), (288, 40)),
+        arrow((238, 40), (288, 40)),
         arrow((490, 40), (570, 40)),
         box(
             8,

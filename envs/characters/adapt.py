@@ -49,30 +49,6 @@ KINDS = {
 """The shape that replaces each shape."""
 
 
-def float_trunk(spec: mujoco.MjSpec, name: str | None = None) -> None:
-    """Give the trunk of a file a free joint, so that MuJoCo does not merge it into the world.
-
-    Args:
-        spec: The file, not compiled.
-        name: The trunk, or None for the body on the world with the most bodies.
-
-    Raises:
-        ValueError: If no such body hangs on the world, or it has joints.
-    """
-    candidates = {body.name: body for body in spec.worldbody.bodies}
-    if not candidates:
-        raise ValueError("--floating needs a body, but the file has none: pass a file with bodies")
-    if name is None:
-        name = max(candidates, key=lambda candidate: len(candidates[candidate].find_all("body")))
-    if name not in candidates:
-        raise ValueError(
-            f"--floating: {name} must be attached to the world: pass one of {', '.join(candidates)} (--root)"
-        )
-    if candidates[name].joints:
-        raise ValueError(f"--floating: {name} already has a joint: leave the option out, or pass another --root")
-    candidates[name].add_freejoint()
-
-
 class Adapted(NamedTuple):
     """A body that was made a character.
 

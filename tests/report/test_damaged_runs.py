@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from torchrl_mcp.cli.report import main
+from torchrl_mcp.commands.report import main
 from torchrl_mcp.report.page import report
 from torchrl_mcp.report.results import find_runs
 

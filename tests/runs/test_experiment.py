@@ -13,7 +13,7 @@ from smoke import SMOKE
 from torch import nn
 
 from torchrl_mcp import conf
-from torchrl_mcp.cli import evaluate, train
+from torchrl_mcp.commands import evaluate, train
 from torchrl_mcp.runs import benchmark, build, experiment, policies, records
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.checkpoint import run_checkpoint

@@ -6,7 +6,7 @@ import threading
 import pytest
 from rich.console import Console
 
-from torchrl_mcp.cli.status import main
+from torchrl_mcp.commands.status import main
 from torchrl_mcp.runs import benchmark, experiment, lock
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.status import look, overview, status, table, write_manifest

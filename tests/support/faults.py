@@ -433,6 +433,12 @@ FAULTS = {
         ('if autocast != "auto" and not isinstance(autocast, bool)', "if False", "training/test_precision.py")
     ],
     # Evaluation
+    "torchrl_mcp/commands/train.py": [
+        ("        sys.argv = former", "        pass", "commands/test_train.py"),
+    ],
+    "torchrl_mcp/commands/demo.py": [
+        ('runs["scratch"].training.total_frames +=', "_ =", "commands/test_demo.py"),
+    ],
     "torchrl_mcp/evaluation/rollout.py": [
         (
             "task_reward(outcome).squeeze(-1) * running",

@@ -74,7 +74,7 @@ def test_workers_act_by_the_newest_weights_and_statistics_in_every_batch_and_ret
     folder = run if backend == "processes" else tmp_path
     if backend == "ray":  # whose start forks, which a large process may not
         arguments = [*SMOKE, f"run_dir={folder}", "collector=ray", *LATENT]
-        subprocess.run([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], check=True)
+        subprocess.run([sys.executable, "-m", "torchrl_mcp.commands.train", *arguments], check=True)
     assert len(rows(folder)) == 3
     for row in rows(folder):  # one gradient step per batch: its samples are of the policy that it changes
         assert float(row["loss/kl"]) == pytest.approx(0, abs=1e-6)
@@ -137,7 +137,7 @@ def test_every_environment_of_every_worker_is_another_and_a_killed_worker_is_nam
 def test_everything_that_ray_started_is_gone_soon_after_the_run_was_killed(tmp_path):
     """Ray's agents wait a minute for its server, which the kernel has ended."""
     arguments = [*SMOKE, f"run_dir={tmp_path}", "collector=ray", "training.total_frames=1000000"]
-    run = subprocess.Popen([sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], start_new_session=True)
+    run = subprocess.Popen([sys.executable, "-m", "torchrl_mcp.commands.train", *arguments], start_new_session=True)
     while not (tmp_path / "metrics.csv").exists():
         assert run.poll() is None
         time.sleep(0.5)

@@ -55,7 +55,7 @@ def test_a_training_whose_ray_workers_fail_while_they_start_ends_with_the_reason
     task = "defaults: [heading, _self_]\nname: failing\ntransfer: {_target_: failing.Failing}\n"
     (tmp_path / "own/task/failing.yaml").write_text(task)
     settings = ["task=failing", "method=scratch", "preset=smoke", "logger=none", "run_dir=run", "collector=ray"]
-    command = [sys.executable, "-m", "torchrl_mcp.cli.train", "--config-dir", "own", *settings]
+    command = [sys.executable, "-m", "torchrl_mcp.commands.train", "--config-dir", "own", *settings]
     done = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )

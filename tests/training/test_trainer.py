@@ -38,7 +38,7 @@ def test_a_run_killed_with_sigkill_continues_to_the_same_numbers_bit_for_bit(tmp
 
     arguments = [*SMOKE, f"run_dir={killed}", *settings]
     run = subprocess.Popen(
-        [sys.executable, "-m", "torchrl_mcp.cli.train", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
+        [sys.executable, "-m", "torchrl_mcp.commands.train", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
     deadline = time.monotonic() + 300
     while not (killed / "metrics.csv").exists() or len(rows(killed)) < 2:

@@ -13,7 +13,7 @@ from torchrl_mcp.training.workers import attend, begun, end, new_workers
 
 COMMAND = """
 import multiprocessing, time
-from torchrl_mcp.cli.train import main
+from torchrl_mcp.commands.train import main
 if __name__ == "__main__":
     worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
     worker.start()
@@ -148,7 +148,7 @@ def test_a_training_whose_workers_fail_while_they_start_ends_with_the_reason_in_
     (tmp_path / "own/task/failing.yaml").write_text(task)
     settings = ["task=failing", "method=scratch", "preset=smoke", "logger=none", "run_dir=run"]
     settings += ["collector=processes", "collector.num_workers=2"]
-    command = [sys.executable, "-m", "torchrl_mcp.cli.train", "--config-dir", "own", *settings]
+    command = [sys.executable, "-m", "torchrl_mcp.commands.train", "--config-dir", "own", *settings]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr

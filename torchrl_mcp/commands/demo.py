@@ -1,36 +1,30 @@
-"""The demonstration: a new gate over MCP's primitives and scratch learn the same task for the same steps, side by side.
+"""``torchrl-mcp-demo``: train a new gate over MCP's primitives and a network from scratch, with equal steps.
 
-Two processes train at once, one core each. All results are written to one folder, and what is already there is reused.
+Both runs train at once, in a process each. All results are written to one folder, and complete results are reused.
 """
 
-import json
+import argparse
 import math
 import shlex
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from dataclasses import replace
-from io import StringIO
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
-from torchrl_mcp import __version__, analysis
-from torchrl_mcp.commands import export
-from torchrl_mcp.commands.demo_page import write_page
-from torchrl_mcp.runs import configuration, experiment, records
-from torchrl_mcp.runs.policies import restore
+from torchrl_mcp import __version__
+from torchrl_mcp.commands.export import write_page
+from torchrl_mcp.commands.parsing import announce, entry_point, new_parser
+from torchrl_mcp.commands.report import write_report
 from torchrl_mcp.runs.processes import start, ticks
-from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training.bar import TrainingBar
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, NORMALISED_RETURN, read_metrics, replacing, write_json
-from torchrl_mcp.viewer.film import save_films
-from torchrl_mcp.viewer.page.folder import ABOUT
-from torchrl_mcp.viewer.player import Player
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, read_json
 
-Runs = Mapping[str, DictConfig]
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    Runs = Mapping[str, DictConfig]
+
+PROGRAM = "torchrl-mcp-demo"
 
 HEADING = ["task=heading", "character=humanoid"]
 RUNS = {
@@ -38,26 +32,59 @@ RUNS = {
     "mcp": ["method=mcp", *HEADING, "stage=transfer"],
     "scratch": ["method=scratch", *HEADING],
 }
-TITLES = {"pretrain": "primitives", "mcp": "MCP", "scratch": "scratch"}
+"""Settings of each run. This is not a file of ``conf/benchmark``, because the runs have budgets of their own."""
+
+TITLES = {"mcp": "MCP", "scratch": "scratch"}
 BUILTIN_STEPS = 10_649_600
 """Environment steps of imitation of the humanoid's primitives that come with the library."""
 
-OWN = ("character", "method", "preset", "pretrained", "run_dir", "stage", "task")
+FIXED = ("character", "method", "preset", "pretrained", "run_dir", "stage", "task")
 """Settings that the demonstration makes itself."""
-
-RECENT = 10
-"""Iterations whose returns are averaged in the line of progress."""
 
 FILM = "film.gif"
 PAGE = "page"
 CONTENTS = {
-    "index.html": "all of it on one page",
-    "results.md, results.json": "the table, and its numbers",
-    "learning_curves.png, .svg, .csv": "both curves",
-    FILM: "both side by side, under the same arrow",
-    PAGE: "web page: the gate in any browser, with nothing installed there",
-    "mcp/, scratch/": "run folders, for every other command",
+    "report.html, report.md": "both runs beside the paper's returns, with learning curves",
+    FILM: "both policies side by side under the same arrow; the bars are MCP's gates",
+    PAGE: "web page: the gate in any browser, without an installation",
+    "mcp, scratch": "run folders, for all other commands",
 }
+
+
+@entry_point(PROGRAM)
+def main(words: list[str]) -> None:
+    """Run or continue the demonstration."""
+    arguments = parser().parse_args(words)
+    announce(PROGRAM)
+    from hydra.errors import HydraException
+
+    from torchrl_mcp.commands.suggestions import answer
+
+    preset = "demo_smoke" if arguments.smoke else "demo"
+    output = arguments.output or Path("runs", "demo-pretrain" if arguments.pretrain else "demo")
+    try:
+        run(output, arguments.overrides, preset=preset, pretrain=arguments.pretrain)
+    except HydraException as error:
+        sys.exit(f"{PROGRAM}: {answer(error, arguments.overrides)}")
+    except KeyboardInterrupt:
+        sys.exit(f"\n{PROGRAM}: interrupted; repeat the command to continue")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(
+        PROGRAM, "Train a new gate that steers a humanoid, and a network from scratch with the same number of steps."
+    )
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="SETTING=VALUE",
+        help="settings of all runs, as for torchrl-mcp-train, such as seed=1",
+    )
+    parser.add_argument("--output", type=Path, help="folder (default runs/demo, or runs/demo-pretrain)")
+    parser.add_argument("--pretrain", action="store_true", help="also train the primitives, which takes longer")
+    parser.add_argument("--smoke", action="store_true", help="only test whether the demonstration runs, in seconds")
+    return parser
 
 
 def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrain: bool = False) -> None:
@@ -75,44 +102,34 @@ def run(folder: Path, overrides: Sequence[str], *, preset: str = "demo", pretrai
     began = time.monotonic()
     runs = configure(folder, overrides, preset=preset, pretrain=pretrain)
     print(introduction(runs, folder), flush=True)
-    cores = [[cfg for name, cfg in runs.items() if name != "scratch"], [runs["scratch"]]]
-    show_progress([start(learn, core) for core in cores], runs)
-    page_writer = start(page, folder)  # on the other core, beside the film
-    rows = results(runs)
-    print("\n" + report(folder, runs, rows))
-    made = {FILM: film(folder, runs)}
+    train(folder, runs)
+    print(f"\n{table(runs)}")
+    page_writer = start(export_page, folder)  # beside the film, because a core is free
+    has_film = film(folder, runs)
+    write_report([folder / name for name in runs], folder)
     page_writer.join()
-    made[PAGE] = (folder / PAGE / ABOUT).exists()
-    write_page(
-        folder,
-        table_rows(rows),
-        caption=caption(runs, rows),
-        film=FILM if made[FILM] else None,
-        curves="learning_curves.svg",
-        commands=commands(folder, runs),
-    )
+    absent = [name for name, made in ((FILM, has_film), (PAGE, _has_page(folder))) if not made]
     print(f"\nAfter {(time.monotonic() - began) / 60:.1f} minutes, in {folder}:")
     for name, content in CONTENTS.items():
-        if made.get(name, True):
-            print(f"  {name:35}{content}")
-    if made[PAGE]:
-        served = shlex.join(["python", "-m", "http.server", "--directory", str(folder / PAGE)])
-        print(f"open the page at http://localhost:8000 after\n    {served}")
+        if name not in absent:
+            print(f"  {name:26}{content}")
     print("next:", *(f"  {what}:\n    {command}" for what, command in commands(folder, runs).items()), sep="\n")
 
 
-def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: bool) -> dict[str, DictConfig]:
+def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: bool) -> "dict[str, DictConfig]":
     """Return the configurations of the runs in ``folder``.
 
     Raises:
         ValueError: If the demonstration makes a setting itself, or the folder holds a run with another configuration.
     """
+    from torchrl_mcp.runs.configuration import compose_run
+
     for word in overrides:
-        if word.lstrip("+~").partition("=")[0] in OWN:
+        if word.lstrip("+~").partition("=")[0] in FIXED:
             raise ValueError(f"the demonstration is of the humanoid's heading: use torchrl-mcp-train to set {word}")
     presets = dict.fromkeys(RUNS, f"preset={preset}") | {"pretrain": f"preset={preset}_pretrain"}
     runs = {
-        name: configuration.compose_run(*words, presets[name], *overrides)
+        name: compose_run(*words, presets[name], *overrides)
         for name, words in RUNS.items()
         if pretrain or name != "pretrain"
     }
@@ -127,7 +144,7 @@ def configure(folder: Path, overrides: Sequence[str], *, preset: str, pretrain: 
     return runs
 
 
-def _require_same(cfg: DictConfig, folder: Path) -> None:
+def _require_same(cfg: "DictConfig", folder: Path) -> None:
     """Check that a run in ``folder``, if there is one, has the configuration, and take over its precision.
 
     Raises:
@@ -135,13 +152,15 @@ def _require_same(cfg: DictConfig, folder: Path) -> None:
     """
     if not (folder / CONFIG).exists():
         return
+    from torchrl_mcp.runs import configuration, records
+
     cfg.autocast = records.run_config(folder).autocast
     if changed := records.changes(folder, configuration.planned(cfg).config):
         raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another --output")
 
 
-def introduction(runs: Runs, folder: Path) -> str:
-    """Return what is going on, and how long it will take."""
+def introduction(runs: "Runs", folder: Path) -> str:
+    """Return a text about the runs and their duration."""
     minutes = runs.get("pretrain", runs["mcp"]).demo.minutes
     if "pretrain" in runs:
         first = (
@@ -154,13 +173,13 @@ def introduction(runs: Runs, folder: Path) -> str:
             f"the humanoid\nwhere an arrow points. {remark(runs)}"
         )
     return (
-        f"{first}\nThis takes about {minutes} minutes on two cores. You may interrupt it: repeat the command to "
-        f"continue. Everything lands in {folder}."
+        f"{first}\nThis takes about {minutes} minutes on two cores. If you interrupt it, repeat the command to "
+        f"continue. All results are written to {folder}."
     )
 
 
-def remark(runs: Runs) -> str:
-    """Return what the comparison is, and what it is not."""
+def remark(runs: "Runs") -> str:
+    """Return how far the comparison is a fair one."""
     if "pretrain" in runs:
         return "Scratch had as many steps as pre-training and transfer together."
     return (
@@ -169,146 +188,125 @@ def remark(runs: Runs) -> str:
     )
 
 
-def learn(runs: Sequence[DictConfig]) -> None:
-    """Train and evaluate runs, one after the other."""
-    with redirect_stdout(StringIO()):  # one line of progress tells of both
-        for cfg in runs:
-            experiment.train_or_resume(cfg)
+def train(folder: Path, runs: "Runs") -> None:
+    """Train and evaluate the runs in two processes, and show their progress.
+
+    Raises:
+        ValueError: If a process fails.
+    """
+    from torchrl_mcp.runs.status import overview
+
+    gate = [cfg for name, cfg in runs.items() if name != "scratch"]
+    with overview(folder, {Path(cfg.run_dir).absolute(): cfg.training.total_frames for cfg in runs.values()}):
+        for _ in ticks([start(learn, gate), start(learn, [runs["scratch"]])], interval=1.0):
+            pass
 
 
-def show_progress(processes: Sequence[BaseProcess], runs: Runs) -> None:
-    """Show one line of progress of all runs until they are trained, then until they are evaluated."""
-    total = sum(map(_steps, runs.values()))
-    done = sum(progress(cfg)[0] for cfg in runs.values())
-    moments = ticks(processes, interval=1.0)
-    with TrainingBar(total, done, estimate=False) as line:
-        for _ in moments:
-            now = {TITLES[name]: progress(cfg) for name, cfg in runs.items()}
-            before, done = done, sum(steps for steps, _ in now.values())
-            line.advance(done - before, ", ".join(f"{name} {value:.2f}" for name, (_, value) in now.items() if value))
-            if done >= total:
-                break
-    print(f"Both play {runs['mcp'].evaluation.episodes} episodes, without and with exploration.", flush=True)
-    for _ in moments:
-        pass
+def learn(runs: "Sequence[DictConfig]") -> None:
+    """Train and evaluate runs, one after the other, with logs in their folders."""
+    from torchrl_mcp.runs import benchmark
+
+    for cfg in runs:
+        benchmark.run(cfg)
 
 
-def progress(cfg: DictConfig) -> tuple[int, float | None]:
-    """Return the steps of a run, and its recent mean return once episodes of full length can have ended."""
-    rows = read_metrics(Path(cfg.run_dir))
-    if not rows:
-        return 0, None
-    task = cfg.task[cfg.stage.name]
-    training = cfg.training
-    full = training.num_envs * task.get("max_episode_steps", cfg.task.evaluation.max_episode_steps)
-    recent = [row[NORMALISED_RETURN] for row in rows[-RECENT:] if row["frames"] > full]
-    ended = [value for value in recent if math.isfinite(value)]
-    return int(rows[-1]["frames"]), sum(ended) / len(ended) if ended else None
+def table(runs: "Runs") -> str:
+    """Return a table of the evaluations, with a caption."""
+    from torchrl_mcp.runs.tables import text_table
 
-
-def results(runs: Runs) -> list[dict[str, Any]]:
-    """Return the rows of the table."""
     rows = []
     for name in ("mcp", "scratch"):
-        numbers = json.loads(Path(runs[name].run_dir, EVALUATION).read_text())
-        before = 0 if name == "scratch" else _steps(runs["pretrain"]) if "pretrain" in runs else BUILTIN_STEPS
-        rows.append({"policy": TITLES[name], "steps": _steps(runs[name]), "steps before": before, **numbers})
-    return rows
-
-
-def report(folder: Path, runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Write table, numbers and learning curves, and return the table with its caption."""
-    table = f"{text_table(table_rows(rows), markdown=True)}\n\n{caption(runs, rows)}"
-    with replacing(folder / "results.md") as partial:
-        partial.write_text(table + "\n", encoding="utf-8")
-    write_json({"rows": list(rows)}, folder / "results.json")
-    curves = [learning_curve(folder, runs, name) for name in ("mcp", "scratch")]
-    analysis.write_curves(curves, folder / "learning_curves.csv")
-    analysis.save_figure(analysis.draw_curves(curves), folder / "learning_curves")
-    return table
-
-
-def learning_curve(folder: Path, runs: Runs, name: str) -> analysis.Curve:
-    """Return the learning curve of a run, which begins after the steps of its pre-training here."""
-    (curve,) = analysis.learning_curves({TITLES[name]: [folder / name]}, num_bins=20)
-    before = _steps(runs["pretrain"]) if name == "mcp" and "pretrain" in runs else 0
-    return replace(curve, frames=curve.frames + before)
-
-
-def caption(runs: Runs, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the caption of the table."""
+        evaluation = read_json(Path(runs[name].run_dir, EVALUATION))
+        deterministic = evaluation["deterministic"]
+        low, high = deterministic["interval"]
+        rows.append(
+            {
+                "policy": TITLES[name],
+                "steps": f"{_steps(runs[name]):,}",
+                "steps before": f"{_steps_before(name, runs):,}",
+                "return": f"{deterministic['normalised_return']:.3f} [{low:.3f}, {high:.3f}]",
+                "exploring": f"{evaluation['stochastic']['normalised_return']:.3f}",
+                "falls": f"{deterministic['terminated']:.0%}",
+            }
+        )
     return (
-        f"Normalised return of {rows[0]['episodes']} episodes with its 95 % interval, and with exploration.\n"
+        f"{text_table(rows)}\n\n"
+        f"Normalised return of {evaluation['episodes']} episodes with its 95 % interval, and with exploration.\n"
         f"{remark(runs)} Seed {runs['mcp'].seed}, torchrl-mcp {__version__}."
     )
 
 
-def table_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Return :func:`results` as text."""
-    return [
-        {
-            "policy": row["policy"],
-            "steps": f"{row['steps']:,}",
-            "steps before": f"{row['steps before']:,}",
-            "return": "{:.3f} [{:.3f}, {:.3f}]".format(
-                row["deterministic"]["normalised_return"], *row["deterministic"]["interval"]
-            ),
-            "exploring": f"{row['stochastic']['normalised_return']:.3f}",
-            "falls": f"{row['deterministic']['terminated']:.0%}",
-        }
-        for row in rows
-    ]
-
-
-def film(folder: Path, runs: Runs) -> bool:
+def film(folder: Path, runs: "Runs") -> bool:
     """Film both policies under the same arrow, unless there is a film; return whether there is one.
 
     No episode ends, so that the arrow, which is drawn from one seed, stays the same for both.
     """
-    path = folder / FILM
-    seconds = runs["mcp"].demo.seconds
-    if path.exists():
+    from torchrl_mcp.runs.policies import restore
+    from torchrl_mcp.viewer.film import save_films
+    from torchrl_mcp.viewer.player import Player
+
+    if (folder / FILM).exists():
         return True
     players = {}
-    for name in ("mcp", "scratch"):
-        fixed = {**runs[name].evaluation.environment, "terminate_on_fall": False, "max_episode_steps": 10**6}
-        _, agent, env = restore(folder / name, num_envs=1, seed=0, **fixed)
-        players[f"{TITLES[name]}, {_steps(runs[name]):,} steps"] = Player(agent.actor.policy, env)
+    for name, title in TITLES.items():
+        endless = {**runs[name].evaluation.environment, "terminate_on_fall": False, "max_episode_steps": 10**6}
+        _, agent, env = restore(folder / name, num_envs=1, seed=0, **endless)
+        players[f"{title}, {_steps(runs[name]):,} steps"] = Player(agent.actor.policy, env)
     try:
-        save_films(players, path, seconds=seconds, width=320, height=240)
+        save_films(players, folder / FILM, seconds=runs["mcp"].demo.seconds, width=320, height=240)
     except RuntimeError as error:
         print(f"no film: {error}")
         return False
     return True
 
 
-def page(folder: Path) -> None:
+def export_page(folder: Path) -> None:
     """Write a web page of the gate, unless there is one.
 
-    It needs npm, and ONNX for Python; without them it prints the reason.
+    This needs npm, and ONNX for Python. Without them it prints the reason.
     """
-    if (folder / PAGE / ABOUT).exists():
+    if _has_page(folder):
         return
-    words = ["torchrl-mcp-export", str(folder / "mcp"), "--page", str(folder / PAGE)]
+    gate = folder / "mcp"
+    page = folder / PAGE
     try:
-        export.page([folder / "mcp"], folder / PAGE, words=words)
+        write_page([gate], page, command=shlex.join(["torchrl-mcp-export", str(gate), "--page", str(page)]))
     except ValueError as error:
         print(f"no web page: {error}", flush=True)
 
 
-def commands(folder: Path, runs: Runs) -> dict[str, str]:
+def _has_page(folder: Path) -> bool:
+    from torchrl_mcp.viewer.page.folder import ABOUT
+
+    return (folder / PAGE / ABOUT).exists()
+
+
+def commands(folder: Path, runs: "Runs") -> dict[str, str]:
     """Return the next commands by what each does."""
-    steer = {"steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"])}
-    if "pretrain" in runs:
-        return steer
-    train = "torchrl-mcp-train method=mcp task=heading character=humanoid stage=transfer pretrained=builtin"
-    return {
-        **steer,
-        "train a gate yourself": f"{train} run_dir=runs/gate",
-        "pre-train the primitives yourself": "torchrl-mcp-demo --pretrain",
-    }
+    listed = {"steer it in the browser": shlex.join(["torchrl-mcp-play", str(folder / "mcp"), "--viewer", "web"])}
+    if _has_page(folder):
+        served = ["python", "-m", "http.server", "--directory", str(folder / PAGE)]
+        listed["open the web page at http://localhost:8000"] = shlex.join(served)
+    if "pretrain" not in runs:
+        listed["train a gate yourself"] = (
+            "torchrl-mcp-train method=mcp task=heading character=humanoid stage=transfer pretrained=builtin "
+            "run_dir=runs/gate"
+        )
+        listed["pre-train the primitives yourself"] = "torchrl-mcp-demo --pretrain"
+    return listed
 
 
-def _steps(cfg: DictConfig) -> int:
-    """Environment steps of a run, rounded up to whole batches."""
+def _steps(cfg: "DictConfig") -> int:
+    """Return the environment steps of a run, rounded up to whole batches."""
     return math.ceil(cfg.training.total_frames / cfg.training.frames_per_batch) * cfg.training.frames_per_batch
+
+
+def _steps_before(name: str, runs: "Runs") -> int:
+    """Return the environment steps of the pre-training of a run."""
+    if name == "scratch":
+        return 0
+    return _steps(runs["pretrain"]) if "pretrain" in runs else BUILTIN_STEPS
+
+
+if __name__ == "__main__":
+    main()

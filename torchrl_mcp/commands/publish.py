@@ -1,22 +1,68 @@
-"""Published policies and their model cards."""
+"""``torchrl-mcp-publish``: a trained policy as a small file, with a model card."""
 
+import argparse
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
-
-from torchrl_mcp.report.comparison import reported
+from torchrl_mcp.commands.parsing import add_trust, announce, count, entry_point, new_parser, settings
 from torchrl_mcp.report.paper import CHARACTERS
-from torchrl_mcp.report.results import Run
-from torchrl_mcp.runs import policies, quoting, records
-from torchrl_mcp.runs.builtin import FOLDER, PREFIX, builtin
-from torchrl_mcp.runs.identity import SAME_RUN, is_among
-from torchrl_mcp.runs.settings import leaves
-from torchrl_mcp.runs.trust import trust_options
-from torchrl_mcp.training import checkpoint, run_folder
-from torchrl_mcp.training.run_folder import CONFIG, MODES, PROVENANCE, read_json
+from torchrl_mcp.runs import builtin, quoting
+from torchrl_mcp.training.run_folder import CONFIG, MODES, PROVENANCE, frames, read_json
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+PROGRAM = "torchrl-mcp-publish"
+
+EXAMPLES = f"""\
+The file contains only the policy, in bfloat16, without the frozen parts of networks that come with the library. All
+commands accept the file as a CHECKPOINT. The model card beside it describes training, task and returns.
+
+examples:
+  {PROGRAM} runs/heading --output heading.torchrl --limits "falls on turns of more than 90 degrees"
+"""
+
+
+@entry_point(PROGRAM)
+def main(words: list[str]) -> None:
+    """Write the file and its card."""
+    arguments = parser().parse_args(words)
+    if arguments.output.suffix != ".torchrl":
+        raise ValueError(f"{arguments.output} must have the name of a checkpoint: end it with .torchrl")
+    if not arguments.run.is_dir():
+        raise ValueError(f"there is no run folder {arguments.run}: pass the folder of a training")
+    announce(PROGRAM)
+    from torchrl_mcp.runs.trust import trusting
+
+    with trusting(arguments.trust):
+        publish(arguments.run, arguments.output, episodes=arguments.episodes, limits=arguments.limits)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = new_parser(PROGRAM, "Write a trained policy as a small file, with a model card beside it.", EXAMPLES)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder, whose newest checkpoint is published")
+    add_trust(parser)
+    parser.add_argument(
+        "--output",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="file to write, which ends in .torchrl; the card ends in .md",
+    )
+    parser.add_argument(
+        "--limits",
+        action="append",
+        default=[],
+        help="a sentence about the limits of the policy, for the card; repeatable",
+    )
+    episodes = settings("train")["evaluation"]["episodes"]
+    parser.add_argument(
+        "--episodes", type=count, default=episodes, help="episodes of the evaluation on the card (default %(default)s)"
+    )
+    return parser
 
 
 def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) -> None:
@@ -29,17 +75,21 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
         limits: Sentences about the policy's limits.
 
     Raises:
-        ValueError: If the folder holds no run, its policy cannot be published, or a file would be overwritten.
+        ValueError: If the folder holds no run, the policy cannot be published, or a file exists already.
     """
     card = output.with_suffix(".md")
     for path in (output, card):
         if path.exists():
             raise ValueError(f"{path} exists already: remove it, or pass another --output")
+    from torchrl_mcp.runs import policies, records
+    from torchrl_mcp.runs.trust import trust_options
+    from torchrl_mcp.training import checkpoint
+
     cfg = records.run_config(run)
     policies.publish_run(run, output)
     numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
-    steps = run_folder.frames(checkpoint.find(run))
+    steps = frames(checkpoint.find(run))
     trust = trust_options(run / CONFIG)
     card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits, trust=trust), encoding="utf-8")
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
@@ -47,7 +97,7 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
 
 def model_card(
     path: Path,
-    cfg: DictConfig,
+    cfg: "DictConfig",
     numbers: Mapping[str, Any],
     origin: Mapping[str, Any],
     *,
@@ -67,8 +117,9 @@ def model_card(
         trust: Options with which commands trust the policy's own modules.
     """
     name = path.stem.removeprefix("mcp-")
-    checkpoint_name = f"{PREFIX}{name}" if path.parent.resolve() == FOLDER.resolve() else path.name
-    play = quoting.command("play", *trust, checkpoint_name, "--viewer", "web")
+    is_builtin = path.parent.resolve() == builtin.FOLDER.resolve()
+    checkpoint = f"{builtin.PREFIX}{name}" if is_builtin else path.name
+    play = quoting.command("play", *trust, checkpoint, "--viewer", "web")
     returns = "\n".join(f"- {mode}: {_returns(numbers[mode])}" for mode in MODES)
     character = CHARACTERS.get(cfg.character.name, cfg.character.name)
     return f"""\
@@ -89,7 +140,7 @@ Limits:
 """
 
 
-def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -> str:
+def _facts(path: Path, cfg: "DictConfig", origin: Mapping[str, Any], steps: int) -> str:
     """Return how a policy was trained, as a list."""
     preset = origin.get("choices", {}).get("preset", "unknown")
     machine = origin.get("machine", {})
@@ -103,29 +154,43 @@ def _facts(path: Path, cfg: DictConfig, origin: Mapping[str, Any], steps: int) -
 
 def command(words: Sequence[str]) -> str:
     """Return the command that started a run, without folders of the machine and settings that make no other run."""
+    from torchrl_mcp.runs.identity import SAME_RUN, is_among
+
     return shlex.join(word for word in words if not is_among(word.partition("=")[0], SAME_RUN))
 
 
-def _contents(path: Path, cfg: DictConfig) -> str:
+def _contents(path: Path, cfg: "DictConfig") -> str:
     """Return the contents of a file, and the source of the policy's other parts."""
+    from torchrl_mcp.training import checkpoint
+
     if not (shared := checkpoint.shared(path)):
         return "the whole policy"
-    origin = builtin(cfg.method.name, cfg.character.name)
     names = " and ".join(shared).replace("_", " ")
-    return f"all but the {names} of `{origin.name}`"
+    return f"all but the {names} of `{builtin.builtin(cfg.method.name, cfg.character.name).name}`"
 
 
 def _returns(numbers: Mapping[str, Any]) -> str:
     """Return the results of one mode in a line, with the interval of the return."""
     metrics = "".join(f", {name.replace('_', ' ')} {value:.3f}" for name, value in numbers["metrics"].items())
-    value, (low, high) = numbers["normalised_return"], numbers["interval"]
+    value = numbers["normalised_return"]
+    low, high = numbers["interval"]
     return f"{value:.3f} ({low:.3f} to {high:.3f}), fallen {numbers['terminated']:.0%}{metrics}"
 
 
-def _paper(path: Path, cfg: DictConfig, origin: Mapping[str, Any]) -> str:
+def _paper(path: Path, cfg: "DictConfig", origin: Mapping[str, Any]) -> str:
     """Return the paper's number in Table 2, if it has one. Its heading has a single speed."""
-    settings = dict(leaves(OmegaConf.to_container(cfg, resolve=True)))
-    paper = reported(Run(path, settings, provenance=origin))
+    from omegaconf import OmegaConf
+
+    from torchrl_mcp.report.comparison import reported
+    from torchrl_mcp.report.results import Run
+    from torchrl_mcp.runs.settings import leaves
+
+    settings_of_run = dict(leaves(OmegaConf.to_container(cfg, resolve=True)))
+    paper = reported(Run(path, settings_of_run, provenance=origin))
     if paper is None or OmegaConf.is_list(cfg.task.evaluation.get("speed")):
         return "no return"
     return f"{paper.mean:.3f} ± {paper.std:.3f}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Answers to mistakes on a command line that Hydra cannot compose."""
+"""Answers to command lines that Hydra cannot compose."""
 
 import difflib
 import os
@@ -18,29 +18,32 @@ EXTRAS = {"joblib": "launchers", "submitit": "launchers", "ray": "ray-launcher",
 
 
 def answer(error: HydraException, words: Sequence[str], *, several: str | None = "give one") -> str:
-    """Return what is wrong with a command line and how to write it, a line for each mistake.
+    """Return a line for each mistake of a command line, with a remedy.
 
     Args:
         error: The exception of Hydra.
         words: The command line.
-        several: What to do about a setting with several values, or None if it may have them.
+        several: Remedy for a setting with several values, or None if settings may have several values.
     """
     settings = [word for word in words if ("=" in word or word.startswith("~")) and not word.startswith("-")]
     lines = stray(words) or unreadable(settings)
-    lines = lines or (swept(settings, several) if several else []) or suggestions(settings)
+    if several and not lines:
+        lines = swept(settings, several)
+    if not lines:
+        lines = suggestions(settings)
     if not lines and isinstance(error, MissingConfigException):
         lines = [_missing(error)]
     return "\n".join(lines) or "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def stray(words: Sequence[str]) -> list[str]:
-    """Return a line if words are no setting, no deletion of one and no option or its value."""
+    """Return a line if words are neither settings nor options or values of options."""
     values = {follower for word, follower in pairwise(words) if word.startswith("-") and "=" not in word}
-    strays = [word for word in words if "=" not in word or word == "="]
-    strays = [word for word in strays if not word.startswith(("-", "~")) and word not in values]
-    return (
-        [f"{' '.join(strays)} is not a setting: write NAME=VALUE without spaces, such as method=mcp"] if strays else []
-    )
+    without_value = [word for word in words if "=" not in word or word == "="]
+    strays = [word for word in without_value if not word.startswith(("-", "~")) and word not in values]
+    if not strays:
+        return []
+    return [f"{' '.join(strays)} is not a setting: write NAME=VALUE without spaces, such as method=mcp"]
 
 
 def unreadable(settings: Sequence[str]) -> list[str]:
@@ -57,7 +60,7 @@ def swept(settings: Sequence[str], remedy: str) -> list[str]:
 
 
 def suggestions(settings: Sequence[str]) -> list[str]:
-    """Return a line for each setting ``key=value`` with an unknown key, with the nearest known keys."""
+    """Return a line for each setting with an unknown name, with the nearest names."""
     try:
         overrides = OverridesParser.create().parse_overrides(list(settings))
         with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
@@ -78,7 +81,7 @@ def suggestions(settings: Sequence[str]) -> list[str]:
 
 
 def _nearest(key: str, known: Collection[str]) -> str:
-    """Return the end of a sentence with the nearest known keys."""
+    """Return the end of a sentence with the nearest names."""
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
     return f"; the nearest are: {', '.join(near)}" if near else ": torchrl-mcp-train --cfg job prints all"
 
@@ -107,19 +110,19 @@ def _missing(error: MissingConfigException) -> str:
         return f"{group}={choice} needs a plugin of Hydra: pip install 'torchrl-mcp[{extra}]'"
     options = list(error.options or [])
     near = difflib.get_close_matches(choice, options, n=1, cutoff=0.5)
-    meant = f"did you mean {near[0]}? " if near else ""
-    return f"there is no {group}={choice}: {meant}The choices are {', '.join(options)}"
+    question = f"did you mean {near[0]}? " if near else ""
+    return f"there is no {group}={choice}: {question}The choices are {', '.join(options)}"
 
 
 def _is_argument(key: str, cfg: DictConfig) -> bool:
     """Return whether a setting is an argument of its group's class or function."""
     group, _, name = key.rpartition(".")
-    made = group and OmegaConf.select(cfg, f"{group}._target_")
-    if not made:
+    target = group and OmegaConf.select(cfg, f"{group}._target_")
+    if not target:
         return False
     from torchrl_mcp.runs import requirements  # takes seconds
 
-    return name in requirements.arguments(made)
+    return name in requirements.arguments(target)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

@@ -1,4 +1,4 @@
-"""Sweeps that go on after a failed run, with every launcher and sweeper of Hydra."""
+"""Sweeps that continue after a failed run, with every launcher and sweeper of Hydra."""
 
 import os
 import shlex
@@ -17,19 +17,19 @@ from omegaconf import DictConfig
 
 
 class Sweep(Callback):
-    """Reports the runs of a sweep that fail, each in a log, and lists them at the end.
+    """Writes a log for each failed run of a sweep, and lists the failed runs at the end.
 
-    To Hydra they end without a return value, since launchers and sweepers would stop at an exception. Optuna counts
-    such a trial as failed. Launchers send this object to their processes with each run.
+    For Hydra a failed run ends without a return value, because launchers and sweepers would stop at an exception.
+    Optuna counts such a trial as failed. Launchers send this object to their processes with each run.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Choose the folder of the logs, not that of a sweep that begins in the same second."""
+        """Choose a folder of the logs that no other sweep uses, even if it begins in the same second."""
         name = f"failed-{datetime.now():%Y-%m-%d-%H%M%S}-{os.getpid()}"
         self.folder = Path(config.hydra.sweep.dir).absolute() / name
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Write the log of a failed run, and take its exception from Hydra."""
+        """Write the log of a failed run, and hide its exception from Hydra."""
         if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
             return
         try:
@@ -49,7 +49,7 @@ class Sweep(Callback):
         """List the failed runs.
 
         Raises:
-            SystemExit: If there are any.
+            SystemExit: If a run has failed.
         """
         if not (logs := sorted(self.folder.glob("*.log"), key=lambda log: int(log.stem))):
             return

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -91,7 +92,7 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
             yield
         return
     ended = threading.Event()
-    thread = threading.Thread(target=_tell, args=(folder, runs, ended), daemon=True)
+    thread = threading.Thread(target=_tell, args=(folder, runs, ended, sys.stdout), daemon=True)
     thread.start()
     try:
         yield
@@ -167,9 +168,8 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
     return result
 
 
-def _tell(folder: Path, runs: Runs | None, ended: threading.Event) -> None:
-    """Print a line whenever a run changes its state."""
-    terminal = sys.stdout  # runs in this process replace sys.stdout by their log
+def _tell(folder: Path, runs: Runs | None, ended: threading.Event, terminal: TextIO) -> None:
+    """Print a line whenever a run changes its state; runs in this process replace ``sys.stdout`` by their log."""
     known: dict[Path, str] = {}
     last = False
     while not last:

@@ -14,7 +14,6 @@ QUIET = 60.0
 BRIEF = 120.0
 """Seconds of a training that needs no estimate."""
 
-
 FIRST = 2.0
 """Seconds of batches that an estimate is made of."""
 
@@ -35,13 +34,10 @@ class TrainingBar:
         total: Environment steps of the training; the last batch may exceed it.
         done: Steps so far.
         shown: Whether to show anything.
-        estimate: Say after the first batches how long it will take.
         file: Output stream, standard error by default.
     """
 
-    def __init__(
-        self, total: int, done: int = 0, *, shown: bool = True, estimate: bool = True, file: TextIO | None = None
-    ) -> None:
+    def __init__(self, total: int, done: int = 0, *, shown: bool = True, file: TextIO | None = None) -> None:
         self._file = file or sys.stderr
         self._total = total
         self._done = done
@@ -50,7 +46,7 @@ class TrainingBar:
         self._began = self._told = time.monotonic()
         self._note = ""
         self._second: tuple[float, int] | None = None  # time and steps at the beginning of the second batch
-        self._estimated = not (shown and estimate)
+        self._estimated = not shown
         form = "{n_fmt}/{total_fmt} {rate_fmt} {elapsed}<{remaining}{postfix}"
         self._bar: tqdm | None = None
         if shown and self._file.isatty():

@@ -23,6 +23,9 @@ from torchrl_mcp.envs.motions.errors import MisreadError, MotionFormatError
 MISREAD = 30.0
 """Degrees beyond its limit that a joint reaches in most frames only if a recording is read wrongly."""
 
+MIRRORED = "_mirrored"
+"""End of the names of mirror images."""
+
 RATE = 30.0
 """Frames per second of clips, unless told otherwise."""
 
@@ -61,6 +64,10 @@ class Import(NamedTuple):
     bodies: Mapping[str, str] = MappingProxyType({})
     missed: Tensor = torch.empty(0)
     ground: str = ""
+
+    def mirrored(self) -> "Import":
+        """Return the mirror image of the motion, for which the same holds."""
+        return self._replace(clip=self.clip.mirrored())
 
 
 def fit_skeleton(

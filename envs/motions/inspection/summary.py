@@ -31,6 +31,12 @@ NEAR = 0.05
 
 GRAVITY = 9.81
 
+SLIDING = 0.2
+"""Speed in m/s above which :func:`foot_slide` is only if a motion is read incorrectly."""
+
+GLIDING = 0.7
+"""The same for :func:`gliding`."""
+
 
 class Summary(NamedTuple):
     """Summary of a clip.

@@ -11,9 +11,10 @@ from refusals import refused
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS, Character
-from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, float_trunk, key_bodies
+from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, key_bodies
 from torchrl_mcp.envs.characters.contract import lowest_bodies, violations
 from torchrl_mcp.envs.characters.drives import LIMIT_ANGLE
+from torchrl_mcp.envs.characters.files import float_trunk
 from torchrl_mcp.envs.characters.sides import guessed_sides, twin
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"

@@ -9,14 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.commands.motions import GLIDING, SLIDING
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.capture.amc import read_asf_amc
 from torchrl_mcp.envs.motions.capture.bvh import read_bvh
 from torchrl_mcp.envs.motions.capture.importer import import_motion, imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.inspection.statistics import gait_statistics
-from torchrl_mcp.envs.motions.inspection.summary import foot_slide, summarised
+from torchrl_mcp.envs.motions.inspection.summary import GLIDING, SLIDING, foot_slide, summarised
 from torchrl_mcp.envs.motions.placement import placing
 
 CHARACTER_LEG = 0.421546 + 0.40987

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.commands.motions import GLIDING
 from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
-from torchrl_mcp.envs.motions.inspection.summary import summarised
+from torchrl_mcp.envs.motions.inspection.summary import GLIDING, summarised
 
 
 def standing(frames, fps=10.0):

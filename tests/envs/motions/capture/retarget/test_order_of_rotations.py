@@ -5,12 +5,11 @@ from itertools import permutations
 import pytest
 from scipy.spatial.transform import Rotation
 
-from torchrl_mcp.commands.motions import GLIDING, SLIDING
 from torchrl_mcp.envs.characters.kinematics import body_names, body_states
 from torchrl_mcp.envs.motions.capture.importer import imported
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.gait.generator import stride
-from torchrl_mcp.envs.motions.inspection.summary import summarised
+from torchrl_mcp.envs.motions.inspection.summary import GLIDING, SLIDING, summarised
 
 BODIES = {"Hips": "root", "Chest": "chest", "Head": "neck"}
 for side in ("left", "right"):

@@ -6,15 +6,14 @@ import pytest
 import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mcp.cli import export
+from torchrl_mcp.commands import export
 from torchrl_mcp.runs.builtin import builtin
 from torchrl_mcp.runs.export import DeterministicPolicy
 from torchrl_mcp.runs.policies import restore
 
 
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-export", *map(str, words)])
-    export.main()
+def call(*words):
+    export.main([*map(str, words)])
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +25,10 @@ def played():
     return steps["observation"], steps["goal"], steps["action"]
 
 
-def test_onnxruntime_and_torch_export_play_the_actions_of_the_policy(played, tmp_path, monkeypatch, capsys):
+def test_onnxruntime_and_torch_export_play_the_actions_of_the_policy(played, tmp_path, capsys):
     onnxruntime = pytest.importorskip("onnxruntime", reason="needs pip install 'torchrl-mcp[onnx]'")
     pytest.importorskip("onnxscript", reason="needs pip install 'torchrl-mcp[onnx]'")
-    call(monkeypatch, "builtin:biped", "--onnx", tmp_path / "biped.onnx", "--torch", tmp_path / "biped.pt2")
+    call("builtin:biped", "--onnx", tmp_path / "biped.onnx", "--torch", tmp_path / "biped.pt2")
     assert "differs from torch by at most" in capsys.readouterr().out
     observation, goal, action = played
     session = onnxruntime.InferenceSession(str(tmp_path / "biped.onnx"))
@@ -44,7 +43,7 @@ def test_onnxruntime_and_torch_export_play_the_actions_of_the_policy(played, tmp
 def test_without_onnx_the_remedy_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxscript", None)
     with pytest.raises(SystemExit, match=r"pip install 'torchrl-mcp\[onnx\]'"):
-        call(monkeypatch, "builtin:biped", "--onnx", tmp_path / "biped.onnx")
+        call("builtin:biped", "--onnx", tmp_path / "biped.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -56,7 +55,7 @@ def test_a_policy_that_remembers_is_refused_by_what_it_reads():
         DeterministicPolicy(Remembering())
 
 
-def test_something_to_write_is_asked_for(monkeypatch, capsys):
+def test_something_to_write_is_asked_for(capsys):
     with pytest.raises(SystemExit):
-        call(monkeypatch, "builtin:biped")
+        call("builtin:biped")
     assert "--onnx FILE, --torch FILE or --page DIR" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import difflib
 import sys
 from importlib import import_module
 
-from torchrl_mcp.cli.parsing import new_parser
+from torchrl_mcp.commands.parsing import entry_point, new_parser
 
 PROGRAM = "torchrl-mcp"
 
@@ -25,26 +25,26 @@ COMMANDS = {
 """What each command does, in the order in which a new user meets them."""
 
 
-def main() -> None:
+@entry_point(PROGRAM)
+def main(words: list[str]) -> None:
     """Run the command that the first word names, with the other words."""
-    name, *words = sys.argv[1:] or ["--help"]
+    name, *arguments = words or ["--help"]
     if name.startswith("-"):
         parser().parse_args([name])
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         nearest = f"the nearest is {near[0]}" if near else f"choose from {', '.join(COMMANDS)}"
         sys.exit(f"{PROGRAM}: there is no command {name}: {nearest}")
-    sys.argv = [f"{PROGRAM}-{name}", *words]  # which Hydra reads, too
-    import_module(f"torchrl_mcp.cli.{name}").main()
+    import_module(f"torchrl_mcp.commands.{name}").main(arguments)
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of ``--help`` and ``--version``, which lists the commands."""
     listed = [f"  {PROGRAM} {name:11}{meaning}" for name, meaning in COMMANDS.items()]
     epilog = "\n".join(["commands, each with its own --help:", *listed])
-    made = new_parser(PROGRAM, "Multiplicative compositional policies: train, watch and compare.", epilog)
-    made.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="see below")
-    return made
+    parser = new_parser(PROGRAM, "Multiplicative compositional policies: train, watch and compare.", epilog)
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="see below")
+    return parser
 
 
 if __name__ == "__main__":

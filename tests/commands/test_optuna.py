@@ -6,7 +6,7 @@ import sys
 import pytest
 import yaml
 
-from torchrl_mcp.cli import train
+from torchrl_mcp.commands import train
 
 pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs pip install 'torchrl-mcp[optuna]'")
 TEN = [f"+note.x{i}=interval(0.0,1.0)" for i in range(10)]

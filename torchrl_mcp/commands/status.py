@@ -5,15 +5,15 @@ import sys
 import threading
 from pathlib import Path
 
-from torchrl_mcp.cli.parsing import explained, new_parser
+from torchrl_mcp.commands.parsing import entry_point, new_parser
 
 PROGRAM = "torchrl-mcp-status"
 
 
-@explained(PROGRAM)
-def main() -> None:
+@entry_point(PROGRAM)
+def main(words: list[str]) -> None:
     """Show the runs of a folder."""
-    arguments = parser().parse_args()
+    arguments = parser().parse_args(words)
     if not arguments.folder.is_dir():
         sys.exit(f"{PROGRAM}: there is no folder {arguments.folder}")
     from rich.console import Console

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from torchrl_mcp.commands.summary import final_return, summary
 from torchrl_mcp.report.paper import TABLE_2
+from torchrl_mcp.report.summary import final_return, summary
 
 CONFIG = """
 task: {name: heading}

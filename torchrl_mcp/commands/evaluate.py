@@ -9,29 +9,39 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from torchrl_mcp.cli.parsing import add_task, add_trust, count, explained, new_parser, seed, settings
-from torchrl_mcp.commands import announce
+from torchrl_mcp.commands.parsing import (
+    CHECKPOINT,
+    add_task,
+    add_trust,
+    announce,
+    count,
+    entry_point,
+    new_parser,
+    seed,
+    settings,
+    task_settings,
+)
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import MODES, write_json
 
 PROGRAM = "torchrl-mcp-evaluate"
 
 
-@explained(PROGRAM)
-def main() -> None:
+@entry_point(PROGRAM)
+def main(words: list[str]) -> None:
     """Play one episode in each of many environments and print the statistics."""
-    arguments = parser().parse_args()
+    arguments = parser().parse_args(words)
     path = locate(arguments.checkpoint)
     announce(PROGRAM)
-    from torchrl_mcp.commands.task_settings import task_settings
     from torchrl_mcp.runs.policies import evaluate_clips, evaluation
     from torchrl_mcp.runs.trust import trusting
 
     with trusting(arguments.trust):
-        settings = task_settings(arguments.task)
-        alone = {"episodes": arguments.clips, "seed": arguments.seed, **settings}
-        clips = evaluate_clips(path, **alone) if arguments.clips else []
-        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed, **settings)
+        changes = task_settings(arguments.task)
+        clips = []
+        if arguments.clips:
+            clips = evaluate_clips(path, episodes=arguments.clips, seed=arguments.seed, **changes)
+        results = evaluation(path, episodes=arguments.episodes, seed=arguments.seed, **changes)
     report(arguments, results, [asdict(clip) for clip in clips])
 
 
@@ -51,10 +61,10 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
             + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
         if reach := numbers.get("reach"):
-            share = round(100 * reach["place"])
-            standing = reach["standing"]
-            ideal = reach["ideal"]
-            print(f"    {share}% of the way from standing still ({standing:.3f}) to an ideal player ({ideal:.3f})")
+            print(
+                f"    {round(100 * reach['place'])}% of the way from standing still ({reach['standing']:.3f}) "
+                f"to an ideal player ({reach['ideal']:.3f})"
+            )
         if diagnostics := numbers["diagnostics"]:
             print(text_table([{"diagnostic": name, "value": value} for name, value in diagnostics.items()]))
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:
@@ -71,16 +81,17 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(
         PROGRAM, "Play episodes with a trained policy, and print returns and diagnostics of gates and options."
     )
-    parser.add_argument(
-        "checkpoint",
-        help="run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK",
-    )
+    parser.add_argument("checkpoint", help=CHECKPOINT)
     defaults = settings("train")["evaluation"]
-    for name, kind, meaning in (
-        ("episodes", count, "number of episodes, one in each environment"),
-        ("seed", seed, "seed of environments and sampling"),
-    ):
-        parser.add_argument(f"--{name}", type=kind, default=defaults[name], help=f"{meaning} (default %(default)s)")
+    parser.add_argument(
+        "--episodes",
+        type=count,
+        default=defaults["episodes"],
+        help="number of episodes, one in each environment (default %(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=seed, default=defaults["seed"], help="seed of environments and sampling (default %(default)s)"
+    )
     parser.add_argument(
         "--clips",
         type=count,

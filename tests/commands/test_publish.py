@@ -3,7 +3,6 @@
 import csv
 import math
 import shutil
-import sys
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -15,8 +14,7 @@ from smoke import SMOKE, configure
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.envs.utils import step_mdp
 
-from torchrl_mcp.cli import evaluate, play, publish
-from torchrl_mcp.commands import publish as publishing
+from torchrl_mcp.commands import evaluate, play, publish
 from torchrl_mcp.evaluation import rollout
 from torchrl_mcp.runs import builtin, experiment, policies
 from torchrl_mcp.runs.configuration import compose_run
@@ -26,14 +24,13 @@ from torchrl_mcp.training import checkpoint
 PRETRAINED = builtin.builtin("mcp", "biped")
 
 
-def call(monkeypatch, command, *words):
-    monkeypatch.setattr(sys, "argv", [command.PROGRAM, *map(str, words)])
-    command.main()
+def call(command, *words):
+    command.main([*map(str, words)])
 
 
-def stopped(monkeypatch, command, *words):
+def stopped(command, *words):
     with pytest.raises(SystemExit) as stop:
-        call(monkeypatch, command, *words)
+        call(command, *words)
     return str(stop.value)
 
 
@@ -60,9 +57,8 @@ def networks(run, tmp_path_factory):
     shutil.copy(PRETRAINED, folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(builtin, "FOLDER", folder)
-        patch.setattr(publishing, "FOLDER", folder)
         gate = folder / "mcp-biped-heading.torchrl"
-        call(patch, publish, run, "--output", gate, "--episodes", 2, "--limits", "It has hardly learnt anything.")
+        call(publish, run, "--output", gate, "--episodes", 2, "--limits", "It has hardly learnt anything.")
     return folder
 
 
@@ -149,9 +145,9 @@ def test_an_entry_that_the_goal_or_the_kept_networks_lack_is_refused(task, pretr
 def test_a_gate_has_a_name_that_commands_take(library, monkeypatch, capsys):
     path = builtin.locate("builtin:biped-heading")
     assert path == builtin.builtin("mcp", "biped", "heading") == library / "mcp-biped-heading.torchrl"
-    call(monkeypatch, evaluate, "builtin:biped-heading", "--episodes", 2)
+    call(evaluate, "builtin:biped-heading", "--episodes", 2)
     assert "builtin:biped-heading: 2 episodes" in capsys.readouterr().out
-    said = stopped(monkeypatch, play, "builtin:biped-flying")
+    said = stopped(play, "builtin:biped-flying")
     assert "no builtin:biped-flying comes with the library: give one of builtin:biped, builtin:biped-heading" in said
 
 
@@ -170,7 +166,7 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
 def test_no_file_is_overwritten(run, taken, tmp_path):
     (tmp_path / taken).write_text("mine")
     output = tmp_path / "notes.torchrl"
-    refused(lambda: publishing.publish(run, output, episodes=1, limits=[]), taken, "--output", untouched=tmp_path)
+    refused(lambda: publish.publish(run, output, episodes=1, limits=[]), taken, "--output", untouched=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -188,7 +184,7 @@ def test_the_card_compares_neither_a_range_of_speeds_nor_a_variant_with_the_pape
     (tmp_path / "my gate.torchrl").write_bytes((builtin.FOLDER / "mcp-humanoid-heading.torchrl").read_bytes())
     cfg = compose_run("task=heading", "character=humanoid", "stage=transfer", f"run_dir={tmp_path}", *settings)
     facts = {"origin": {}, "steps": 1, "limits": [], "trust": ["--trust", "own"]}
-    card = publishing.model_card(tmp_path / "my gate.torchrl", cfg, numbers, **facts)
+    card = publish.model_card(tmp_path / "my gate.torchrl", cfg, numbers, **facts)
     assert said in card
     assert "`torchrl-mcp-play --trust own 'my gate.torchrl' --viewer web`" in card
 
@@ -223,13 +219,13 @@ def test_over_other_primitives_than_its_own_a_gate_is_neither_played_nor_publish
         "primitives",
         "mcp-biped.torchrl",
     )
-    said = stopped(monkeypatch, publish, run, "--output", tmp_path / "again.torchrl")
+    said = stopped(publish, run, "--output", tmp_path / "again.torchrl")
     assert "trained over other primitives than mcp-biped.torchrl" in said
 
 
 def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatch, tmp_path):
-    assert "no run folder" in stopped(monkeypatch, publish, tmp_path / "nowhere", "--output", tmp_path / "a.torchrl")
-    assert "end it with .torchrl" in stopped(monkeypatch, publish, run, "--output", tmp_path / "a.zip")
+    assert "no run folder" in stopped(publish, tmp_path / "nowhere", "--output", tmp_path / "a.torchrl")
+    assert "end it with .torchrl" in stopped(publish, run, "--output", tmp_path / "a.zip")
 
 
 @pytest.mark.parametrize("character", ["biped", "humanoid", "trex"])

@@ -10,7 +10,7 @@ import pytest
 from refusals import refused
 
 from torchrl_mcp import __version__
-from torchrl_mcp.cli import main, train
+from torchrl_mcp.commands import main, train
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]

@@ -2,7 +2,6 @@
 
 import csv
 import shutil
-import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -11,10 +10,10 @@ import pytest
 from matplotlib.image import imread
 from omegaconf import OmegaConf
 
-from torchrl_mcp.cli import figures
-from torchrl_mcp.commands import figures as drawing
+from torchrl_mcp.analysis import checkpoints, exploration, walk_cycle
+from torchrl_mcp.commands import figures
 from torchrl_mcp.envs.motions.single import single_motion
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.publish import publish
 
@@ -64,9 +63,8 @@ def runs(tmp_path_factory):
     }
 
 
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-figures", *map(str, arguments)])
-    figures.main()
+def call(*words):
+    figures.main([*map(str, words)])
 
 
 def rows(path):
@@ -79,7 +77,7 @@ def shows_something(stem):
 
 
 def test_two_runs_share_a_figure_of_learning_curves(runs, tmp_path, monkeypatch):
-    call(monkeypatch, "curves", runs["mcp"], runs["moe"], "--output", tmp_path)
+    call("curves", runs["mcp"], runs["moe"], "--output", tmp_path)
     assert shows_something(tmp_path / "curves")
     found = rows(tmp_path / "curves.csv")
     assert {row["label"] for row in found} == {"mcp", "moe"}
@@ -88,7 +86,7 @@ def test_two_runs_share_a_figure_of_learning_curves(runs, tmp_path, monkeypatch)
 
 def test_exploration_has_a_panel_per_checkpoint_and_one_of_noise(runs, tmp_path, monkeypatch, capsys):
     checkpoints = [runs[name] for name in ("mcp", "moe", "latent", "sequence", "options")]
-    call(monkeypatch, "exploration", *checkpoints, "--trajectories", 3, "--seconds", 0.5, "--output", tmp_path)
+    call("exploration", *checkpoints, "--trajectories", 3, "--seconds", 0.5, "--output", tmp_path)
     assert shows_something(tmp_path / "exploration_biped")
     numbers = rows(tmp_path / "exploration_biped_summary.csv")
     panels = [row["panel"] for row in numbers]
@@ -113,7 +111,7 @@ def test_exploration_works_with_the_ant_and_tells_runs_of_one_method_apart(runs,
     checkpoints = [tmp_path / "one" / "seed0", tmp_path / "other" / "seed0", runs["ant options"]]
     for name, copy in zip(("ant", "ant transfer"), checkpoints, strict=False):
         shutil.copytree(runs[name], copy)
-    call(monkeypatch, "exploration", *checkpoints, "--trajectories", 2, "--seconds", 0.3, "--output", tmp_path)
+    call("exploration", *checkpoints, "--trajectories", 2, "--seconds", 0.3, "--output", tmp_path)
     panels = [row["panel"] for row in rows(tmp_path / "exploration_ant_summary.csv")]
     assert panels[:2] == ["MCP, random weights", "MCP, random weights (other-seed0)"]
     assert len(panels) == 4
@@ -122,7 +120,7 @@ def test_exploration_works_with_the_ant_and_tells_runs_of_one_method_apart(runs,
 def test_exploration_repeats_itself_with_the_same_seed(runs, tmp_path, monkeypatch):
     for folder in ("a", "b"):
         settings = ["--trajectories", 2, "--seconds", 0.5, "--seed", 3, "--output", tmp_path / folder]
-        call(monkeypatch, "exploration", runs["mcp"], *settings)
+        call("exploration", runs["mcp"], *settings)
     first, second = ((tmp_path / folder / "exploration_biped.csv").read_bytes() for folder in "ab")
     assert first == second
 
@@ -130,7 +128,7 @@ def test_exploration_repeats_itself_with_the_same_seed(runs, tmp_path, monkeypat
 @pytest.mark.trajectories
 def test_primitives_that_come_with_the_library_walk_in_step_with_their_reference(tmp_path, monkeypatch, capsys):
     settings = ["--walkers", 2, "--seconds", 4, "--output", tmp_path]
-    call(monkeypatch, "primitives", "builtin:biped", *settings)
+    call("primitives", "builtin:biped", *settings)
     assert shows_something(tmp_path / "primitives_mcp-biped")
     trained, untrained = rows(tmp_path / "primitives.csv")
     assert (trained["networks"], untrained["networks"]) == ("trained", "untrained")
@@ -150,7 +148,7 @@ def test_primitives_that_come_with_the_library_walk_in_step_with_their_reference
 
 
 def test_holdout_draws_trajectories_by_direction_and_curves(runs, tmp_path, monkeypatch):
-    call(monkeypatch, "holdout", runs["ant"], runs["ant transfer"], runs["ant options"], "--output", tmp_path)
+    call("holdout", runs["ant"], runs["ant transfer"], runs["ant options"], "--output", tmp_path)
     for name in ("holdout_mcp", "holdout_option_critic", "holdout_curves"):
         assert shows_something(tmp_path / name)
     seen, held_out = (0.0, 4.7124), (4.7124, 6.2832)
@@ -177,7 +175,7 @@ def test_holdout_averages_runs_of_the_same_settings_alone(runs, tmp_path, monkey
         OmegaConf.save(settings, copy / "config.yaml")
         metrics = (copy / "metrics.csv").read_text()
         (copy / "metrics.csv").write_text(metrics.replace(",0.1", f",{value}").replace(",0.3", f",{value}"))
-    call(monkeypatch, "holdout", *copies, "--output", tmp_path)
+    call("holdout", *copies, "--output", tmp_path)
     found = {
         (row["label"], row["seeds"], round(float(row["mean"]), 6)) for row in rows(tmp_path / "holdout_curves.csv")
     }
@@ -192,16 +190,16 @@ def test_a_character_of_your_own_has_its_name_in_titles(tmp_path, monkeypatch):
         raise Drawn(title)
 
     cfg = OmegaConf.create({"method": {"title": "Mine"}, "character": {"name": "spider"}})
-    monkeypatch.setattr(drawing, "_explored", lambda arguments: ({}, "spider"))
-    monkeypatch.setattr(drawing.exploration, "draw_exploration", draw)
-    monkeypatch.setattr(drawing.policies, "policy_config", lambda path: cfg)
-    monkeypatch.setattr(drawing.checkpoints, "walk_of", lambda *_, **__: (None, {}))
-    monkeypatch.setattr(drawing, "draw_walk_cycle", draw)
+    monkeypatch.setattr(figures, "_explored", lambda arguments: ({}, "spider"))
+    monkeypatch.setattr(exploration, "draw_exploration", draw)
+    monkeypatch.setattr(policies, "policy_config", lambda path: cfg)
+    monkeypatch.setattr(checkpoints, "walk_of", lambda *_, **__: (None, {}))
+    monkeypatch.setattr(walk_cycle, "draw_walk_cycle", draw)
     shared = {"checkpoints": [tmp_path], "output": tmp_path, "seconds": 1.0, "seed": 0}
     with pytest.raises(Drawn, match="spider, 2 times"):
-        drawing.explore(Namespace(trajectories=2, **shared))
+        figures.explore(Namespace(trajectories=2, **shared))
     with pytest.raises(Drawn, match="Mine, spider, walking"):
-        drawing.analyse(Namespace(clip=None, walkers=1, **shared))
+        figures.analyse(Namespace(clip=None, walkers=1, **shared))
 
 
 @pytest.mark.parametrize(
@@ -219,5 +217,5 @@ def test_a_character_of_your_own_has_its_name_in_titles(tmp_path, monkeypatch):
 )
 def test_what_cannot_be_drawn_is_refused_by_name(command, names, name, runs, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=name):
-        call(monkeypatch, command, *(runs[run] for run in names), "--output", tmp_path)
+        call(command, *(runs[run] for run in names), "--output", tmp_path)
     assert list(tmp_path.iterdir()) == []

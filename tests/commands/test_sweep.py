@@ -75,7 +75,7 @@ def test_runs_from_other_networks_have_folders_of_their_own(command, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not find_spec("hydra_plugins"), reason="needs pip install 'torchrl-mcp[launchers]'")
 def test_processes_list_their_failed_runs_at_the_end(tmp_path):
-    words = ["-m", "torchrl_mcp.cli.train", *SWEEP, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    words = ["-m", "torchrl_mcp.commands.train", *SWEEP, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
     outcome = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True)
     assert outcome.returncode
     assert len(failures(outcome)) == 3

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from torchrl_mcp.cli import motions
-from torchrl_mcp.commands import motions as motion_files
+from torchrl_mcp.commands import motions
 from torchrl_mcp.envs.characters import CHARACTERS
+from torchrl_mcp.envs.motions.capture import paper_corpus
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import stride
 from torchrl_mcp.envs.motions.trex import trex_walk
@@ -33,10 +33,9 @@ def run(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", ["torchrl-mcp-motions", *map(str, words)])
         status, error = 0, ""
         try:
-            motions.main()
+            motions.main([*map(str, words)])
         except SystemExit as end:
             status, error = (1, f"{end.code}\n") if isinstance(end.code, str) else (end.code, "")
         captured = capsys.readouterr()
@@ -56,7 +55,7 @@ def test_import_replaces_no_recording(run, tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
     for words in (["walk.txt"], ["walk.txt", "--output", "own"], ["clip.npz"], ["clip.txt", "--mirror"]):
         status, _, errors = run("import", *words)
-        assert "is a recording that the clip would replace: give another --output" in f"{status}{errors}"
+        assert "is a recording that the clip would replace: pass another --output" in f"{status}{errors}"
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.npz")} == before
 
 
@@ -169,6 +168,13 @@ def test_a_clip_reaches_a_character_of_a_module_with_the_bodies_that_are_printed
     assert re.search(r"Bones miss their directions in walk by \d+\.\d deg in the median", output)
     assert MotionClip.load(tmp_path / "clips" / "walk.npz").character == "lizard"
     assert "follows" not in run("inspect", "clips/walk.npz", "--module", "lizard")[1]
+
+
+def test_without_a_human_body_there_is_no_table_of_strides(run):
+    trex_walk(1.0, 0.0).save("trex.npz")
+    status, output, errors = run("inspect", "trex.npz", "--strides")
+    assert (status, errors) == (0, "")
+    assert output.splitlines()[-1].startswith("no strides: ")
 
 
 def test_inspect_shows_the_strides_of_people_if_asked_to(run):
@@ -296,7 +302,7 @@ def test_what_was_assumed_about_the_vertical_is_said(run, tmp_path):
 def corpus(folder, **seconds):
     """The files of the paper's corpus, in which nobody moves a limb."""
     (folder / "deep").mkdir(parents=True)
-    for name, duration in {**motion_files.PAPER_CORPUS, **seconds}.items():
+    for name, duration in {**paper_corpus.DURATIONS, **seconds}.items():
         if name.endswith(".txt"):
             loop = "wrap" if name == "humanoid3d_walk.txt" else "none"
             (folder / "deep" / name).write_text(motion(duration, loop, speed=0.1))
@@ -356,7 +362,7 @@ WRONG = {
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: pass it \(--fps\)"),
-    "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map left_knee is not of the form PART=JOINT"),
+    "wrong map": (["import", "cut.bvh", "--map", "left_knee"], "--map: 'left_knee' must have the form PART=JOINT"),
     "wrong option": (["import", "stand.txt", "--scale", "2"], "scale does not apply to stand.txt"),
     "wrong rate": (["import", "stand.txt", "--rate", "0"], "rate=0.0 leaves less than two frames"),
     "no seconds": (["render", "stand.txt", "--seconds", "0"], "'0' must be a duration: pass more than 0 seconds"),
@@ -390,7 +396,7 @@ def test_what_is_wrong_is_said_without_a_traceback(run, tmp_path, words, message
 
 
 def test_help_shows_examples():
-    command = [sys.executable, "-m", "torchrl_mcp.cli.motions", "--help"]
+    command = [sys.executable, "-m", "torchrl_mcp.commands.motions", "--help"]
     result = subprocess.run(command, capture_output=True, text=True, cwd="/")
     assert result.returncode == 0
     for name in ("import", "inspect", "render", "build-paper-corpus"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_mcp.cli import export
+from torchrl_mcp.commands import export
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.runs.policies import restore
 

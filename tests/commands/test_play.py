@@ -3,15 +3,13 @@ import sys
 import pytest
 from PIL import Image
 
-from torchrl_mcp.cli import play
-from torchrl_mcp.commands import play as playing
+from torchrl_mcp.commands import play
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.rendering import opengl
 
 
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-play", *map(str, arguments)])
-    play.main()
+def call(*words):
+    play.main([*map(str, words)])
 
 
 BIPED = "builtin:biped"
@@ -54,7 +52,7 @@ def test_what_cannot_be_played_is_refused_without_a_traceback(monkeypatch, tmp_p
     for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(variable, raising=False)
     with pytest.raises(SystemExit) as stopped:
-        call(monkeypatch, *words)
+        call(*words)
     opengl._platform.cache_clear()
     said = f"{stopped.value}{capsys.readouterr().err}"
     assert name in said.replace("usage: torchrl-mcp-play", "")
@@ -62,10 +60,10 @@ def test_what_cannot_be_played_is_refused_without_a_traceback(monkeypatch, tmp_p
     assert {path.name for path in tmp_path.iterdir()} == {"empty", "notes.txt"}
 
 
-def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_for(monkeypatch, tmp_path, capsys):
+def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_for(tmp_path, capsys):
     path = tmp_path / "films" / "film.gif"
     try:
-        call(monkeypatch, "builtin:biped", "--output", path, "--seconds", 0.2, "--width", 160, "--height", 120)
+        call("builtin:biped", "--output", path, "--seconds", 0.2, "--width", 160, "--height", 120)
     except SystemExit as error:
         if "no OpenGL" not in str(error):
             raise
@@ -78,20 +76,21 @@ def test_networks_that_come_with_the_library_play_in_a_film_of_the_size_asked_fo
 
 def test_without_what_writes_mp4_a_film_is_refused_before_anything_is_simulated(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    monkeypatch.setattr(playing, "play", lambda arguments: pytest.fail("the policy is restored"))
+    monkeypatch.setattr(play, "trained", lambda *arguments: pytest.fail("the policy is restored"))
     with pytest.raises(SystemExit, match=r"torchrl-mcp\[video\]"):
-        call(monkeypatch, "builtin:biped", "--output", tmp_path / "films" / "film.mp4")
+        call("builtin:biped", "--output", tmp_path / "films" / "film.mp4")
     assert not (tmp_path / "films").exists()
 
 
 @pytest.mark.parametrize(("agent", "moves"), [("zero", False), ("random", True)])
 def test_an_agent_that_has_learnt_nothing_shows_an_environment(monkeypatch, agent, moves):
     shown = []
-    monkeypatch.setattr(playing, "show", lambda policy, env, options, arguments: shown.append((policy, env)))
-    call(monkeypatch, "--agent", agent, "task=heading", "character=trex", "--seed", 3)
-    [(policy, env)] = shown
-    assert isinstance(env, Heading)
-    actions = env.rollout(3, policy)["action"]
-    assert actions.shape[-1] == 49
-    assert bool(actions.any()) == moves
-    assert (actions.abs() <= 1).all()
+    monkeypatch.setattr(play, "show", lambda player, arguments: shown.append(player))
+    call("--agent", agent, "task=heading", "character=trex", "--seed", 3)
+    [player] = shown
+    assert isinstance(player.env, Heading)
+    for _ in range(3):
+        player.step()
+        assert player.action.shape[-1] == 49
+        assert bool(player.action.any()) == moves
+        assert (player.action.abs() <= 1).all()

@@ -8,8 +8,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 
 import torchrl_mcp.conf
-from torchrl_mcp.cli.train import main
-from torchrl_mcp.commands.suggestions import suggestions
+from torchrl_mcp.commands.train import main
 from torchrl_mcp.runs import benchmark
 
 CONF = Path(torchrl_mcp.conf.__file__).parent
@@ -41,8 +40,7 @@ def test_every_choice_of_every_group_composes(choices):
 )
 def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypatch, capsys, task, curriculum, mixture):
     arguments = [f"task={task}", f"curriculum={curriculum}", "stage=transfer", "--cfg", "job", "--resolve"]
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
-    main()
+    main(arguments)
     printed = yaml.safe_load(capsys.readouterr().out)
     assert len((printed["curriculum"]["aids"] or {}).get("mixture", [])) == mixture
     assert (
@@ -52,74 +50,10 @@ def test_the_configuration_can_be_printed_with_all_references_resolved(monkeypat
 
 @pytest.mark.parametrize("words", [["--cfg", "hydra"], ["-c", "hydra"], ["--cfg=hydra"]])
 def test_hydras_own_settings_can_be_printed_with_all_references_resolved(monkeypatch, capsys, words):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "run_root=elsewhere", "--resolve", *words])
-    main()
+    main(["run_root=elsewhere", "--resolve", *words])
     printed = yaml.safe_load(capsys.readouterr().out)
     assert printed["sweep"]["dir"] == "elsewhere/multirun"
     assert "method" not in printed
-
-
-@pytest.mark.parametrize(
-    ("argument", "meant"),
-    [
-        ("num_primitivs=4", "num_primitives"),
-        ("trainig.num_envs=64", "training.num_envs"),
-        ("mixr=additive", "mixer"),
-        ("objective.loss.clip_epsilom=0.1", "objective.loss.clip_epsilon"),
-        ("hydra.swep.dir=runs", "hydra.sweep.dir"),
-    ],
-)
-def test_an_unknown_setting_is_answered_with_the_nearest_that_exist(argument, meant):
-    (line,) = suggestions([argument])
-    key, _ = argument.split("=")
-    assert line.startswith(f"'{key}' is not a setting")
-    assert line.split("the nearest are: ")[1].split(", ")[0] == meant
-
-
-@pytest.mark.parametrize(
-    ("arguments", "written"),
-    [
-        (["imitation.switch_to=same"], "+imitation.switch_to="),
-        (["task=heading", "task.transfer.terminate_on_fall=false"], "+task.transfer.terminate_on_fall="),
-        (["critic.num_cells=[16]"], "+critic.num_cells="),
-    ],
-)
-def test_an_argument_that_no_file_names_is_answered_with_a_plus(arguments, written):
-    (line,) = suggestions(arguments)
-    assert written in line
-    assert suggestions([*arguments[:-1], f"+{arguments[-1]}"]) == []
-
-
-def test_a_setting_like_no_other_is_answered_with_how_to_list_all():
-    (line,) = suggestions(["qqqqqqqq=1"])
-    assert line == "'qqqqqqqq' is not a setting of this method: torchrl-mcp-train --cfg job prints all"
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["method=scratch", "preset=smoke", "seed=3", "training.num_envs=8", "stage.gamma=0.9"],
-        ["mixer=additive,multiplicative", "seed=range(3)", "--multirun"],
-        ["hydra.run.dir=out"],
-        ["+note=new"],
-        ["~logger"],
-        pytest.param(["method=scratch", "parts.policy.std=0.2"], id="a setting of another method"),
-    ],
-)
-def test_settings_that_exist_are_left_alone(arguments):
-    assert suggestions(arguments) == []
-
-
-def test_only_the_unknown_among_several_are_answered():
-    lines = suggestions(["method=scratch", "parts.polcy.std=0.2", "seed=1", "sead=2"])
-    assert [line.split("'")[1] for line in lines] == ["parts.polcy.std", "sead"]
-    assert "parts.policy.std" in lines[0]
-
-
-@pytest.mark.parametrize("arguments", [["mixer"], ["a=[1,"], ["method=no_such", "sead=2"]])
-def test_what_hydra_cannot_parse_is_left_to_hydra(arguments):
-    assert suggestions(arguments) == []
 
 
 @pytest.mark.parametrize(
@@ -157,8 +91,15 @@ def test_options_may_follow_settings_and_a_damaged_file_is_named(command, tmp_pa
     assert "Traceback" not in outcome.stderr
 
 
+def test_the_command_line_of_the_process_stays_and_completion_is_of_the_command(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["torchrl-mcp", "train", "-sc", "install=bash"])
+    main(["-sc", "install=bash"])
+    assert capsys.readouterr().out.split()[-1] == "torchrl-mcp-train"
+    assert sys.argv == ["torchrl-mcp", "train", "-sc", "install=bash"]
+
+
 def test_without_assertions_the_remedy_is_said(tmp_path):
-    words = [sys.executable, "-O", "-m", "torchrl_mcp.cli.train", "--multirun", "seed=range(0,2)"]
+    words = [sys.executable, "-O", "-m", "torchrl_mcp.commands.train", "--multirun", "seed=range(0,2)"]
     outcome = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert outcome.returncode
     assert outcome.stderr.splitlines()[-1].endswith("unset PYTHONOPTIMIZE, or drop -O")
@@ -175,9 +116,8 @@ def test_without_assertions_the_remedy_is_said(tmp_path):
     ],
 )
 def test_a_mistake_in_a_benchmark_is_answered_with_what_there_is(monkeypatch, capsys, arguments, answer):
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", *arguments])
     with pytest.raises(SystemExit) as stop:
-        main()
+        main(arguments)
     assert stop.value.code
     said = capsys.readouterr().err + str(stop.value.code)
     assert answer in said
@@ -190,7 +130,6 @@ def test_a_benchmark_of_your_own_is_found(monkeypatch, tmp_path):
     planned = []
     monkeypatch.setattr(benchmark, "launch", lambda jobs, launcher: planned.extend(jobs) or jobs)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-train", "--config-dir", "own", "benchmark=mine"])
     with pytest.raises(SystemExit, match="scratch"):  # what was planned has not been done
-        main()
+        main(["--config-dir", "own", "benchmark=mine"])
     assert [(job.config["method"]["name"], job.config["seed"]) for job in planned] == [("scratch", 4)]

@@ -1,19 +1,29 @@
-"""Parsing for all commands. This module imports neither torch nor MuJoCo nor Hydra, which take seconds to import."""
+"""What the commands share: entry points, parsers and options.
+
+This module imports neither torch nor MuJoCo nor Hydra, which take seconds to import.
+"""
 
 import argparse
 import math
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, cast
 
 import yaml  # type: ignore[import-untyped]
 
 from torchrl_mcp import __version__
+from torchrl_mcp.runs.quoting import quoted
+
+CHECKPOINT = "run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK"
+"""Help of an argument that names a policy."""
+
+RESERVED = ("seed", "num_envs", "device", "episodes", "path")
+"""Arguments of tasks that the commands pass, so that ``--task`` must not."""
 
 
 def new_parser(program: str, description: str, examples: str = "") -> argparse.ArgumentParser:
@@ -31,24 +41,36 @@ def new_parser(program: str, description: str, examples: str = "") -> argparse.A
     return parser
 
 
-def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], None]], Callable[[], None]]:
-    """Return a decorator of a command's function that ends it with a sentence if it is interrupted or its input is bad.
+class EntryPoint(Protocol):
+    """A command as a function."""
 
-    In Python's development mode (``-X dev``) bad input ends it with a traceback.
+    def __call__(self, words: Sequence[str] | None = None) -> None:
+        """Run the command.
+
+        Args:
+            words: The command line after the name of the command, or None for that of this process.
+        """
+
+
+def entry_point(program: str, *errors: type[Exception]) -> Callable[[Callable[[list[str]], None]], EntryPoint]:
+    """Return a decorator that makes a function of the words of a command line the entry point of a command.
+
+    The command ends with a sentence if it is interrupted or its input is bad. In Python's development mode (``-X dev``)
+    bad input ends it with a traceback.
 
     Args:
         program: Name of the command.
-        others: Errors, beside OSError, ValueError and YAML's, that are due to the command's input.
+        errors: Errors, beside OSError, ValueError and YAML's, that are due to the command's input.
     """
 
-    def decorate(main: Callable[[], None]) -> Callable[[], None]:
+    def decorate(main: Callable[[list[str]], None]) -> EntryPoint:
         @wraps(main)
-        def run() -> None:
+        def run(words: Sequence[str] | None = None) -> None:
             try:
-                main()
+                main(list(sys.argv[1:] if words is None else words))
             except KeyboardInterrupt:
                 sys.exit(f"\n{program}: interrupted")
-            except (OSError, ValueError, yaml.YAMLError, *others) as error:
+            except (OSError, ValueError, yaml.YAMLError, *errors) as error:
                 if sys.flags.dev_mode:
                     raise
                 if isinstance(error, yaml.YAMLError):
@@ -58,6 +80,11 @@ def explained(program: str, *others: type[Exception]) -> Callable[[Callable[[], 
         return run
 
     return decorate
+
+
+def announce(program: str) -> None:
+    """Print that a command is importing its libraries, which takes seconds without other output."""
+    print(f"{program} {__version__}: loading PyTorch and MuJoCo ...", file=sys.stderr, flush=True)
 
 
 def find_own_modules() -> None:
@@ -70,6 +97,23 @@ def find_own_modules() -> None:
     clone = str(Path(__file__).parents[2])
     is_last = clone in sys.path and Path(clone, "pyproject.toml").is_file()
     sys.path.insert(sys.path.index(clone) if is_last else len(sys.path), os.getcwd())
+
+
+def own_settings(folder: Path | None) -> list[str]:
+    """Return the settings by which Hydra finds a folder of the user's settings, and make the user's modules importable.
+
+    Args:
+        folder: The folder, or None for no settings.
+
+    Raises:
+        ValueError: If there is no such folder.
+    """
+    if folder is None:
+        return []
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}: correct --config-dir")
+    find_own_modules()
+    return [f"hydra.searchpath=[{quoted(f'file://{folder.resolve()}')}]"]
 
 
 def own_module(name: str) -> str:
@@ -132,7 +176,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
     """Return the modules that a command line trusts, and the command line without them."""
     trusted = []
-    others = []
+    kept = []
     rest = iter(words)
     for word in rest:
         if word == "--trust":
@@ -140,12 +184,12 @@ def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
         elif word.startswith("--trust="):
             trusted.append(own_module(word.removeprefix("--trust=")))
         else:
-            others.append(word)
-    return trusted, others
+            kept.append(word)
+    return trusted, kept
 
 
 def add_task(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--task``, and list its keys below the options."""
+    """Add the option ``--task``, whose words :func:`task_settings` reads, and list its keys below the options."""
     parser.add_argument(
         "--task",
         action="append",
@@ -156,6 +200,33 @@ def add_task(parser: argparse.ArgumentParser) -> None:
     lines = [f"{task}: {', '.join(names)}" for task, names in _task_arguments()]
     listed = "\n".join(textwrap.fill(line, 110, initial_indent="  ", subsequent_indent="    ") for line in lines)
     parser.epilog = f"arguments of the tasks (--task):\n{listed}\n\n{parser.epilog or ''}"
+
+
+def task_settings(words: list[str]) -> dict[str, Any]:
+    """Return the values of ``--task KEY=VALUE`` by key; a dot in a key leads to an entry of an argument.
+
+    Raises:
+        ValueError: If a word cannot be read, has no value or a wrong one, or names an argument that the command passes.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from torchrl_mcp.runs.validation import wrong_values
+
+    if valueless := [word for word in words if "=" not in word]:
+        raise ValueError(f"--task {valueless[0]} has no value: write --task {valueless[0]}=VALUE")
+    try:
+        config = OmegaConf.from_dotlist(words)
+    except (OmegaConfBaseException, LookupError) as error:
+        raise ValueError(f"--task {' '.join(words)} cannot be read: {' '.join(str(error).split())}") from error
+    settings = cast("dict[str, Any]", OmegaConf.to_container(config))
+    if unread := [name for name in RESERVED if name in settings]:
+        raise ValueError(
+            f"--task {unread[0]} would have no effect: use the options of this command, which --help lists"
+        )
+    if wrong := list(wrong_values(settings)):
+        raise ValueError("\n".join(f"--task {line}" for line in wrong))
+    return settings
 
 
 def settings(name: str) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def test_a_run_that_cannot_go_on_says_why(cfg, monkeypatch, failure, sentence):
     ids=" ".join,
 )
 def test_in_development_mode_a_command_ends_with_a_traceback(words, tmp_path):
-    command = [sys.executable, "-X", "dev", "-W", "ignore", "-m", f"torchrl_mcp.cli.{words[0]}", *words[1:]]
+    command = [sys.executable, "-X", "dev", "-W", "ignore", "-m", f"torchrl_mcp.commands.{words[0]}", *words[1:]]
     assert "Traceback" in subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stderr
 
 
@@ -92,10 +92,9 @@ def test_in_development_mode_a_command_ends_with_a_traceback(words, tmp_path):
     ],
     ids=lambda words: words[-1],
 )
-def test_an_option_with_a_wrong_value_is_named(words, name, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", words)
+def test_an_option_with_a_wrong_value_is_named(words, name, capsys):
     with pytest.raises(SystemExit) as stop:
-        import_module(f"torchrl_mcp.cli.{words[0]}").main()
+        import_module(f"torchrl_mcp.commands.{words[0]}").main(words[1:])
     assert name in f"{stop.value.code}{capsys.readouterr().err}"
 
 
@@ -117,7 +116,6 @@ def test_a_result_that_cannot_be_written_ends_in_a_sentence(words, monkeypatch, 
     (tmp_path / "run/config.yaml").write_text("seed: 0")
     shutil.copy(Path(characters.__file__).with_name("biped.xml"), "robot.xml")
     (tmp_path / "run/metrics.csv").write_text("iteration,frames,episode/count,episode/normalised_return\n1,128,1,0.5\n")
-    monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit) as stop:
-        import_module(f"torchrl_mcp.cli.{words[0]}").main()
+        import_module(f"torchrl_mcp.commands.{words[0]}").main(words[1:])
     assert re.fullmatch(rf"torchrl-mcp-{words[0]}: .*(File exists|Not a directory): 'file.*'", str(stop.value.code))

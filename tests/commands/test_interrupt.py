@@ -2,11 +2,10 @@
 
 import os
 import signal
-import sys
 
 import pytest
 
-from torchrl_mcp.cli import evaluate
+from torchrl_mcp.commands import evaluate
 from torchrl_mcp.training.workers import termination_as_interrupt
 
 
@@ -15,9 +14,8 @@ def test_an_interrupt_during_the_imports_of_a_command_is_no_traceback(monkeypatc
         raise KeyboardInterrupt
 
     monkeypatch.setattr(evaluate, "announce", interrupt)
-    monkeypatch.setattr(sys, "argv", ["torchrl-mcp-evaluate", "builtin:biped"])
     with pytest.raises(SystemExit, match="interrupted"):
-        evaluate.main()
+        evaluate.main(["builtin:biped"])
 
 
 def test_sigterm_is_an_interrupt_within_the_block_alone():
