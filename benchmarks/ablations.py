@@ -1,11 +1,12 @@
-"""Table 4, Figure 8, and MCP with other mixers and other exploration: the runs, archived, with their tables and curves.
+"""Archives the runs of Table 4, Figure 8, and MCP with other mixers and exploration, and writes tables and curves.
 
-    # likewise benchmark=mixer, exploration and freeze, and task=heading
+    # repeat this command with benchmark=mixer, exploration and freeze, and with task=heading
     torchrl-mcp-train benchmark=num_primitives preset=comparison character=biped run_root=runs/ablations
     python benchmarks/ablations.py runs/ablations    # archives the complete runs, and writes the results
     python benchmarks/ablations.py                   # writes the results again, from the archive
 
-Everything lands in ``results/ablations``, as in ``results/table2``. ``table.md`` has a row for each variant of MCP.
+The script writes to ``results/ablations``, with the same files as in ``results/table2``. ``table.md`` has a row for
+each variant of MCP.
 """
 
 from collections.abc import Sequence
@@ -19,32 +20,33 @@ from torchrl_mcp.runs.tables import text_table
 
 RESULTS = Path(__file__).resolve().parent / "results" / "ablations"
 VARIED = ("num_primitives", "mixer", "exploration", "trained")
-"""Choices of transfer that are ablated; those of pre-training are the first two."""
+"""Choices that are ablated; the first two also affect pre-training."""
 
 
 def main() -> None:
     """Archive runs if a folder is given, and write the results of the archive."""
-    with archived(__doc__, RESULTS) as (found, output):
-        table = text_table(variants(found), markdown=True)
+    with archived(__doc__, RESULTS) as (groups, output):
+        table = text_table(variants(groups), markdown=True)
         (output / "table.md").write_text(table + "\n")
         print(table)
-        write_tables(found, output)
+        write_tables(groups, output)
 
 
-def variants(found: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return a row for each variant: its settings, the imitation that it begins with, and its score in each task.
+def variants(groups: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Return a row for each variant: its settings, the result of its pre-training, and its score in each task.
 
-    Columns name the character if there are several. Methods that lack one of the settings are left out.
+    Columns name the character if there are several. Methods that lack one of the settings are omitted.
 
     Raises:
         SystemExit: If two cells of a variant differ in other settings.
     """
-    transfers = [cell for cell in found if cell.stage == "transfer" and None not in chosen(cell)]
-    imitated = {(chosen(cell, 2), cell.place[1]): completed(cell) for cell in found if cell.stage == "pretrain"}
+    transfers = [cell for cell in groups if cell.stage == "transfer" and None not in chosen(cell)]
+    imitated = {(chosen(cell, 2), cell.place[1]): completed(cell) for cell in groups if cell.stage == "pretrain"}
     scores: dict[Any, Cell] = {}
     for cell in transfers:
-        if (other := scores.setdefault((chosen(cell), cell.place), cell)) is not cell:
-            raise SystemExit(f"{label(other)} and {label(cell)} are one row of the table: archive one of them alone")
+        first = scores.setdefault((chosen(cell), cell.place), cell)
+        if first is not cell:
+            raise SystemExit(f"{label(first)} and {label(cell)} are one row of the table: archive only one of them")
     places = dict.fromkeys(cell.place for cell in transfers)
     characters = dict.fromkeys(character for _, character in places)
     ends = {character: f", {character}" if len(characters) > 1 else "" for character in characters}
@@ -62,13 +64,13 @@ def chosen(cell: Cell, count: int = len(VARIED)) -> tuple[Any, ...]:
 
 
 def order(variant: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the key of a row: fewer primitives first, and of as many, MCP's own settings first."""
+    """Return the sort key of a row: fewer primitives come first, then MCP's standard settings."""
     num_primitives, mixer, exploration, trained = variant
     return num_primitives, mixer == "additive", exploration == "action", trained != "gate"
 
 
 def completed(cell: Cell) -> str:
-    """Return the share of episodes of imitation in which the character keeps up with its references to the end."""
+    """Return the share of episodes of imitation in which the character follows its references to the end."""
     return f"{1 - average([run.evaluation['deterministic']['terminated'] for run in cell.complete]):.0%}"
 
 

@@ -1,7 +1,7 @@
-"""Archives of runs: run folders without checkpoints, and the tables and learning curves of the runs in them.
+"""Writes archives of runs, which are run folders without checkpoints, and tables and learning curves of these runs.
 
-An archive has the configuration, the evaluation and the origin of each run, and of its metrics only the columns of
-learning curves. ``torchrl-mcp-report`` reads it unpacked.
+An archive contains the configuration, the evaluation and the provenance of each run, and the metrics of learning
+curves. ``torchrl-mcp-report`` reads an unpacked archive.
 """
 
 import argparse
@@ -29,26 +29,26 @@ from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, MODES, 
 
 ARCHIVE = "runs.tar.xz"
 CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
-"""Columns of metrics in an archive: those of learning curves and wall times."""
+"""Columns of metrics in an archive, which are needed for learning curves and wall times."""
 
 EMPTY = ""
-"""A cell of a table without runs, or without a number in the paper."""
+"""Text of a table's cell without runs, or without a number in the paper."""
 
 
 @contextmanager
 def archived(description: str, results: Path) -> Iterator[tuple[list[Cell], Path]]:
-    """Archive runs if the command line gives a folder of them, and unpack the archive.
+    """Archive runs if the command line gives a folder of runs, and unpack the archive.
 
     Args:
-        description: Of the script.
-        results: Folder of the archive, unless the command line gives another.
+        description: Description of the script.
+        results: Folder of the archive, unless the command line gives another folder.
 
     Yields:
         The archived runs as cells, and the folder of the archive.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", type=Path, nargs="?", help="the run_root of the runs; default: the archive")
-    parser.add_argument("--output", type=Path, default=results, help="folder to write to, with the archive")
+    parser.add_argument("runs", type=Path, nargs="?", help="run_root of runs to archive; default: read the archive")
+    parser.add_argument("--output", type=Path, default=results, help="folder of the archive and of the results")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     archive = arguments.output / ARCHIVE
@@ -63,14 +63,14 @@ def archived(description: str, results: Path) -> Iterator[tuple[list[Cell], Path
 
 
 def pack(root: Path, archive: Path) -> None:
-    """Write the complete runs of a folder, without checkpoints and without names of folders of this machine.
+    """Write the complete runs of a folder to an archive, without checkpoints and without paths of this machine.
 
     Raises:
-        SystemExit: If there are none.
+        SystemExit: If the folder contains no complete run.
     """
     runs = [run for run in find_runs([root])[0] if run.state == "complete"]
     if not runs:
-        raise SystemExit(f"{root} holds no complete run: give a folder of runs that are trained and evaluated")
+        raise SystemExit(f"{root} contains no complete run: give a folder of runs that are trained and evaluated")
     with replacing(archive) as partial, tarfile.open(partial, "w:xz", preset=9) as packed:
         for run in runs:
             files = (run.path / name for name in (CONFIG, EVALUATION, PROVENANCE))
@@ -84,60 +84,64 @@ def pack(root: Path, archive: Path) -> None:
 
 
 def curve(metrics: Path) -> str:
-    """Return the metrics of a run with the columns of ``CURVE`` alone."""
-    kept = io.StringIO()
+    """Return the metrics of a run with only the columns of ``CURVE``."""
+    columns = io.StringIO()
     with metrics.open(newline="") as file:
-        writer = csv.DictWriter(kept, CURVE, extrasaction="ignore", lineterminator="\n")
+        writer = csv.DictWriter(columns, CURVE, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(csv.DictReader(file))
-    return kept.getvalue()
+    return columns.getvalue()
 
 
-def write_tables(found: Sequence[Cell], output: Path) -> None:
+def write_tables(groups: Sequence[Cell], output: Path) -> None:
     """Write the table and the learning curves of each task, and the list of all runs.
 
-    In a task, runs with more steps than the shortest of their method are in the table alone; all of scratch's are
-    among the curves. A picture ends at four times the steps of its shortest curve.
+    The table of a task contains all runs. The curves omit runs that have more steps than the shortest runs of their
+    method, except for scratch. A picture ends at four times the steps of its shortest curve.
     """
-    for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in found):
-        here = [cell for cell in found if (cell.place, cell.stage) == (place, stage)]
+    for place, stage in dict.fromkeys((cell.place, cell.stage) for cell in groups):
+        of_task = [cell for cell in groups if (cell.place, cell.stage) == (place, stage)]
         twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
         stem = output / "_".join([*place, stage] if twice else place)
-        goal = 0.8 * max((float(curve.mean[-1]) for cell in here if (curve := learning_curve(cell))), default=math.inf)
-        stem.with_suffix(".md").write_text(text_table([line(cell, goal) for cell in here], markdown=True) + "\n")
-        drawn = [cell for cell in here if stage == "pretrain" or cell.method == "scratch" or is_short(cell, here)]
+        curves = [curve for cell in of_task if (curve := learning_curve(cell))]
+        goal = 0.8 * max((float(curve.mean[-1]) for curve in curves), default=math.inf)
+        stem.with_suffix(".md").write_text(text_table([line(cell, goal) for cell in of_task], markdown=True) + "\n")
+        drawn = [cell for cell in of_task if stage == "pretrain" or cell.method == "scratch" or is_short(cell, of_task)]
         if curves := [curve for cell in drawn if (curve := learning_curve(cell))]:
             figure = draw_curves(curves, ylabel="normalised return in training")
             ends = [float(curve.frames[-1]) for curve in curves]
             figure.axes[0].set_xlim(0, min(4 * min(ends), max(ends)))
             save_figure(figure, stem)
-    write(output / "runs.csv", [row for cell in found for run in cell.complete for row in rows(cell, run)])
+    write(output / "runs.csv", [row for cell in groups for run in cell.complete for row in rows(cell, run)])
 
 
-def is_short(cell: Cell, others: Sequence[Cell]) -> bool:
-    """Return whether a cell has at most as many steps as any of its method, or scratch as any of the other methods."""
-    alike = [other for other in others if other.method != "scratch" and cell.method in ("scratch", other.method)]
-    steps = [other.complete[0].total_frames for other in alike]
+def is_short(cell: Cell, cells: Sequence[Cell]) -> bool:
+    """Return whether no cell of the same method has fewer steps.
+
+    A cell of scratch is compared with the cells of all other methods.
+    """
+    compared = [one for one in cells if one.method != "scratch" and cell.method in ("scratch", one.method)]
+    steps = [one.complete[0].total_frames for one in compared]
     return cell.complete[0].total_frames <= min(steps, default=0)
 
 
 def label(cell: Cell) -> str:
-    """Return the name of a cell in the table of its task: the method, and how it differs from others of the method.
+    """Return the name of a cell in the table of its task: the method, and the differences from its other cells.
 
-    Settings that are the method's standard, or that a run leaves to a default, are left out.
+    Settings with the method's standard value or with their default are omitted.
     """
     standard = cell.runs[0].standard
-    others = [
+    settings = [
         f"pre-trained {value / 1e6:g} M" if name.startswith("budget.pretrain") else f"{name}={value}"
         for name, value in cell.settings.items()
         if name not in ("preset", "total_frames") and value != standard.get(name, DEFAULT)
     ]
     steps = [f"{cell.complete[0].frames / 1e6:.1f} M steps"] if "total_frames" in cell.settings else []
-    return ", ".join([cell.title, *steps, *others])
+    return ", ".join([cell.title, *steps, *settings])
 
 
 def line(cell: Cell, goal: float) -> dict[str, Any]:
-    """Return a row of the table of a task, with the minutes to a return in training."""
+    """Return a row of the table of a task, with the minutes until the return in training reaches ``goal``."""
     chosen = [run.evaluation["deterministic"] for run in cell.complete]
     deviation = f" ± {cell.deviation():.3f}" if len(cell.by_seed) > 1 else ""
     facts: dict[str, Any] = {
@@ -163,7 +167,7 @@ def line(cell: Cell, goal: float) -> dict[str, Any]:
 
 
 def minutes_to(cell: Cell, goal: float) -> float | None:
-    """Return the minutes of training until the learning curve, a mean over seeds, reaches a return; None if never."""
+    """Return the minutes of training until the learning curve, a mean over seeds, reaches a return, or None."""
     if not (curve := learning_curve(cell)):
         return None
     reached = [frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= goal]
@@ -171,16 +175,16 @@ def minutes_to(cell: Cell, goal: float) -> float | None:
 
 
 def learning_curve(cell: Cell) -> Curve | None:
-    """Return the learning curve of a cell, of the first run of each seed, in bins of its own steps.
+    """Return the learning curve of a cell, from the first run of each seed, in bins of the cell's steps.
 
-    Runs in which no episode of full length has ended are left out; without others, there is no curve.
+    Runs in which no episode of full length has ended are omitted. If no run remains, the result is None.
     """
     paths = [runs[0].path for runs in cell.by_seed.values() if runs[0].has_episodes]
     return learning_curves({label(cell): paths})[0] if paths else None
 
 
 def score(cell: Cell | None) -> str:
-    """Return a cell in a table: the mean deterministic return, the share of successes, and the number of seeds."""
+    """Return the text of a cell: the mean deterministic return, the share of successes, and the number of seeds."""
     if cell is None:
         return EMPTY
     success = f", {share(cell)}" if share(cell) else EMPTY
@@ -188,17 +192,17 @@ def score(cell: Cell | None) -> str:
 
 
 def share(cell: Cell) -> str:
-    """Return the share of successful episodes of a task that has successes."""
+    """Return the share of successful episodes, or an empty text for tasks that do not define success."""
     return f"{cell.metrics['success']:.0%}" if "success" in cell.metrics else EMPTY
 
 
 def average(values: Sequence[float]) -> float:
-    """Return the mean."""
+    """Return the mean of values."""
     return sum(values) / len(values)
 
 
 def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
-    """Yield the facts about a run with its results, for each mode."""
+    """Yield a row with a run's settings, results and provenance for each mode."""
     machine = run.provenance.get("machine", {})
     commands = [run.provenance.get("command", []), *(entry["command"] for entry in run.provenance.get("extended", []))]
     for mode in MODES:

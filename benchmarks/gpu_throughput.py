@@ -1,16 +1,17 @@
-"""Steps and training samples per second of MuJoCo Warp on a GPU, beside ``mujoco.batch`` on the same machine.
+"""Measures steps and training samples per second of MuJoCo Warp on a GPU, and of ``mujoco.batch`` on the same machine.
 
     python benchmarks/gpu_throughput.py                         # hours, writes results/gpu_throughput.csv
-    python benchmarks/gpu_throughput.py --quick --device cpu    # a minute, to see that it runs; writes nothing
+    python benchmarks/gpu_throughput.py --quick --device cpu    # a minute, tests that the script runs; writes nothing
 
 ``steps`` are control steps per second of the environments alone, with random actions and new episodes, through
-TorchRL's ``step_and_maybe_reset``. ``samples`` are those of whole training iterations of MCP: acting, physics, resets,
-advantages, gradient steps, metrics. An iteration takes 8 steps of each environment, and two passes over them in 16
-minibatches. Networks are on ``--device`` with both engines, in the precision of ``autocast=auto``.
+TorchRL's ``step_and_maybe_reset``. ``samples`` are samples per second of whole training iterations of MCP: acting,
+physics, resets, advantages, gradient steps, metrics. An iteration takes 8 steps of each environment, and makes two
+passes over these samples in 16 minibatches. With both engines, networks are on ``--device``, in the precision of
+``autocast=auto``.
 
-Each measurement has its own process. Kernels are compiled and loaded before the clock starts, and the first training
-iteration is not counted. ``setup_seconds`` is the time until then; it is longer where kernels are not in Warp's cache.
-A row without numbers is a measurement that failed, with its error above the table.
+Each measurement has a separate process. Kernels are compiled and loaded before the clock starts, and the first training
+iteration is not counted. ``setup_seconds`` is the time until the clock starts, which is longer if kernels are not in
+Warp's cache. A row without numbers is a measurement that failed; its error is printed above the table.
 """
 
 import argparse
@@ -41,12 +42,12 @@ SCENES = (
 )
 SIZES, ENGINES = (1024, 2048, 4096, 8192, 16384), ("warp", "mujoco")
 STEPS, MINIBATCHES, EPOCHS = 8, 16, 2
-"""Control steps of an iteration, and how its samples are learned from."""
+"""Control steps of an iteration, and numbers of minibatches and of passes over its samples."""
 MEASURED = ("steps", "samples", "setup_seconds")
 
 
 def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, iterations: int) -> dict[str, Any]:
-    """Measure an engine in a scene, and return a row's :data:`MEASURED`."""
+    """Measure an engine in a scene, and return the columns :data:`MEASURED` of a row."""
     start = time.perf_counter()
     task, character = scene.split("-")
     stage = "pretrain" if task in ("imitation", "holdout") else "transfer"
@@ -84,7 +85,7 @@ def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, 
 
 
 def play(env: Any, steps: int) -> float:
-    """Step environments at random, and return the seconds."""
+    """Take steps with random actions, and return the seconds."""
     state = env.reset()
     actions = [env.action_spec.rand() for _ in range(steps)]
     wait(env.device)
@@ -96,13 +97,13 @@ def play(env: Any, steps: int) -> float:
 
 
 def wait(device: torch.device) -> None:
-    """Wait until the device has done its work."""
+    """Wait until the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 class Record:
-    """A metrics writer that keeps the speed of each iteration."""
+    """A metrics writer that stores the speed of each iteration."""
 
     def __init__(self) -> None:
         self.speeds: list[float] = []
@@ -113,18 +114,18 @@ class Record:
 
 
 def row(scene: str, physics: str, num_envs: int, *settings: Any) -> dict[str, Any]:
-    """Measure in a separate process; return the row."""
+    """Measure in a separate process, and return the row."""
     job = json.dumps([scene, physics, num_envs, *settings])
     done = subprocess.run([sys.executable, __file__, "--job", job], stdout=subprocess.PIPE, text=True, check=False)
-    found = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else dict.fromkeys(MEASURED, "")
-    return {"scene": scene, "physics": physics, "num_envs": num_envs, **found}
+    numbers = json.loads(done.stdout.splitlines()[-1]) if done.returncode == 0 else dict.fromkeys(MEASURED, "")
+    return {"scene": scene, "physics": physics, "num_envs": num_envs, **numbers}
 
 
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one scene, 16 environments, one iteration")
-    parser.add_argument("--device", default="cuda", help="of Warp and of all networks")
+    parser.add_argument("--device", default="cuda", help="device of Warp and of all networks")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES, metavar="TASK-CHARACTER")
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), help="numbers of environments")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="threads of mujoco.batch")
@@ -140,16 +141,18 @@ def main() -> None:
             Heading("biped", 1, physics=physics)
     except ValueError as error:
         parser.error(str(error))
-    quick, threads = arguments.quick, arguments.threads
+    quick = arguments.quick
+    threads = arguments.threads
     scenes, sizes, iterations = (SCENES[:1], [16], 1) if quick else (arguments.scenes, arguments.sizes, 4)
     conditions = {"threads": threads, "iterations": iterations, **about(), **machine(arguments.device)}
     conditions |= {name: version(name) for name in ("mujoco-warp", "warp-lang")}
     print(" | ".join(f"{key} {value}" for key, value in conditions.items()), flush=True)
-    output, rows = arguments.output or (None if quick else RESULTS), []
+    output = arguments.output or (None if quick else RESULTS)
+    rows = []
     for scene, num_envs, physics in product(scenes, sizes, ENGINES):
         rows.append(row(scene, physics, num_envs, arguments.device, threads, iterations))
         print(" ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
-        if output:  # after every row: a long measurement may be cut off
+        if output:  # after every row, because a long measurement may be interrupted
             write(output, [{**each, **conditions} for each in rows])
     print(table(rows))
 

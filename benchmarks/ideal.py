@@ -1,11 +1,11 @@
-"""Bounds on the return of each task: of standing still, and of an ideal player.
+"""Computes bounds on the return of each task: the returns of standing still and of an ideal player.
 
     python benchmarks/ideal.py    # a minute, writes results/ideal.csv
 
 The ideal player has no body: object and character move straight to their targets at the task's speed, and wait there
-(:mod:`torchrl_mcp.envs.ideal`). Returns are normalised means over 1,000 episodes, drawn as in the evaluation. The
-reward of holdout has no upper bound; its ideal is Gymnasium's threshold for solved. ``--quick`` takes seconds, draws 20
-episodes and writes nothing unless given ``--output``.
+(:mod:`torchrl_mcp.envs.ideal`). Returns are normalised means over 1,000 episodes, which are drawn as in evaluations.
+The reward of holdout has no upper bound; its ideal is the return at which Gymnasium counts the task as solved.
+``--quick`` takes seconds, draws 20 episodes and writes nothing without ``--output``.
 """
 
 import argparse
@@ -32,11 +32,11 @@ VARIANTS: list[tuple[str, str, dict[str, Any]]] = [
     ("dribble", "trex", {}),
     ("holdout", "ant", {}),
 ]
-"""Tasks as evaluated, and variants with another reward or length."""
+"""Tasks as they are evaluated, and variants with another reward or length."""
 
 
 def rows(episodes: int) -> Iterator[dict[str, Any]]:
-    """Draw episodes of each variant, and yield their bounds."""
+    """Draw episodes of each variant, and yield the bounds on their returns."""
     for task, character, changes in VARIANTS:
         stage = "pretrain" if task == "holdout" else "transfer"
         cfg = compose_run(f"task={task}", f"character={character}", f"stage={stage}")

@@ -1,12 +1,13 @@
-"""What the loss of one primitive breaks: the biped's MCP follows each walk without it.
+"""Measures how the biped's MCP follows each walk without one of its primitives.
 
-    python benchmarks/lesions.py    # 15 minutes on a core, writes results/lesions.csv
+    python benchmarks/lesions.py    # 15 minutes on one core, writes results/lesions.csv
 
-Of the three pre-trainings in ``results/table2/networks``, one primitive after the other is taken out of the product
-(weight 0) or held at its mean weight, so that its gate says nothing any more. ``completed`` is the share of episodes
-without a fall or the loss of the reference, for each clip and over all; ``steps`` is their mean length, at most 300.
-Episodes are deterministic and begin at times spread evenly over the clip. ``--quick`` takes seconds, loses one
-primitive of one seed, and writes nothing unless given ``--output``.
+For each of the three pre-trainings in ``results/table2/networks``, the script removes one primitive after the other
+from the product (weight 0), or fixes its weight at the mean, so that the gate no longer controls it. ``completed`` is
+the share of episodes in which the biped neither falls nor loses the reference, for each clip and over all clips.
+``steps`` is the mean length of the episodes, at most 300. Episodes are deterministic, and their beginnings are spread
+evenly over the clip. ``--quick`` takes seconds, removes one primitive of one seed, and writes nothing without
+``--output``.
 """
 
 import argparse
@@ -25,16 +26,21 @@ from torchrl_mcp.runs import policies
 
 RESULTS = Path(__file__).resolve().parent / "results"
 EPISODES = 16
-"""Episodes for each clip."""
+"""Number of episodes per clip."""
 
 
 class Lesion(nn.Module):
-    """Weights of which one does not depend on the input; their mean over all calls is kept."""
+    """Fixes the weight of one primitive, and stores the mean weights of every call.
+
+    Args:
+        primitive: Number of the primitive, from 0, or None for an intact gate.
+        weight: The fixed weight.
+    """
 
     def __init__(self, primitive: int | None = None, weight: float = 0.0) -> None:
-        """Take the primitive, counted from 0, or None for an intact gate, and its weight."""
         super().__init__()
-        self.primitive, self.weight = primitive, weight
+        self.primitive = primitive
+        self.weight = weight
         self.means: list[Tensor] = []
 
     def forward(self, gates: Tensor) -> Tensor:
@@ -46,7 +52,7 @@ class Lesion(nn.Module):
 
 
 def follow(network: Path, lesion: Lesion, *, episodes: int, threads: int) -> list[ClipResult]:
-    """Follow every clip with a lesion, in ``episodes`` episodes each."""
+    """Follow every clip with a lesion, each in ``episodes`` episodes."""
     agent, env = policies.restore_for_clips(network, episodes=episodes, seed=12345, num_threads=threads)
     *before, head = cast("ProbabilisticTensorDictSequential", agent.actor.policy)
     policy = ProbabilisticTensorDictSequential(
@@ -56,21 +62,21 @@ def follow(network: Path, lesion: Lesion, *, episodes: int, threads: int) -> lis
 
 
 def rows(seeds: list[int], primitives: int, *, episodes: int, threads: int) -> Iterator[dict[str, Any]]:
-    """Yield what each seed completes intact, and without or with a constant weight of each primitive."""
+    """Yield rows of the intact networks, and of each primitive with weight 0 and with its mean weight."""
     for seed in seeds:
         network = RESULTS / "table2" / "networks" / f"mcp-biped-{seed}.torchrl"
         intact = Lesion()
         results = follow(network, intact, episodes=episodes, threads=threads)
         yield row(seed, "none", "", results, episodes)
-        usual = torch.stack(intact.means).mean(0).tolist()
-        for kind, weights in (("weight 0", [0.0] * len(usual)), ("mean weight", usual)):
+        means = torch.stack(intact.means).mean(0).tolist()
+        for kind, weights in (("weight 0", [0.0] * len(means)), ("mean weight", means)):
             for primitive, weight in enumerate(weights[:primitives]):
                 results = follow(network, Lesion(primitive, weight), episodes=episodes, threads=threads)
                 yield row(seed, kind, primitive + 1, results, episodes)
 
 
 def row(seed: int, lesion: str, primitive: int | str, results: list[ClipResult], episodes: int) -> dict[str, Any]:
-    """Return the numbers of one lesion; primitives are counted from 1, as in figures."""
+    """Return the row of one lesion, in which primitives are counted from 1, as in figures."""
     return {
         "seed": seed,
         "lesion": lesion,
@@ -85,7 +91,7 @@ def row(seed: int, lesion: str, primitive: int | str, results: list[ClipResult],
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one seed, one primitive, one episode for each clip")
+    parser.add_argument("--quick", action="store_true", help="one seed, one primitive, one episode per clip")
     parser.add_argument("--threads", type=int, default=1, help="threads of networks and physics")
     parser.add_argument("--output", type=Path, help="CSV file; without --quick it is lesions.csv by default")
     arguments = parser.parse_args()

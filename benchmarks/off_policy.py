@@ -1,12 +1,12 @@
-r"""A new gate over frozen primitives by soft actor-critic, TorchRL's SACLoss, beside this library's PPO.
+r"""Trains a new gate over frozen primitives by soft actor-critic (TorchRL's SACLoss) and by this library's PPO.
 
     python benchmarks/off_policy.py     # half an hour on one core; writes results/off_policy.csv and figures
 
-The built-in primitives of the biped are frozen, and both learners train a gate for the heading task with the same 32
-environments. SAC's part needs nothing of this library's training: an action is the eight gates, and ``PlayGates`` plays
-the composite's mean. PPO is ``torchrl-mcp-train``. Evaluations play one deterministic
-episode of the printed task in each of 64 environments. Seconds are of the processor, without evaluations.
-``--quick`` takes seconds and learns nothing.
+The built-in primitives of the biped are frozen, and both learners train a gate for the heading task with 32 equal
+environments. SAC uses no part of this library's training: an action is the eight gates, and ``PlayGates`` plays the
+mean of the composite. PPO is ``torchrl-mcp-train``. Evaluations play one deterministic episode of the paper's task in
+each of 64 environments. ``cpu_seconds`` are processor time without evaluations. ``--quick`` takes seconds and learns
+nothing.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from torchrl_mcp.training import run_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "off_policy.csv"
 K = 8
-"""Number of the built-in primitives."""
+"""Number of built-in primitives."""
 EVALUATION_SEED = 12345
 GAMMA, LR, UPDATES = 0.97, 5e-4, 3
 """SAC's discount, step size, and updates after each step of all environments."""
@@ -57,14 +57,15 @@ PPO = (
 
 
 class PlayGates(Transform):
-    """Makes the gates the action: the environment gets the mean action of frozen primitives under them.
+    """Makes the gates the action: the environment receives the mean action of the frozen primitives with these gates.
 
-    It also normalises the observation, which the primitives and all new networks read.
+    The transform also normalises the observation, which the primitives and all new networks read.
     """
 
     def __init__(self, normaliser: nn.Module, primitives: nn.Module) -> None:
         super().__init__(in_keys=["observation"], in_keys_inv=["action"])
-        self.normaliser, self.primitives = normaliser.requires_grad_(False), primitives.requires_grad_(False)
+        self.normaliser = normaliser.requires_grad_(False)
+        self.primitives = primitives.requires_grad_(False)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set("observation", self.normaliser(next_tensordict["observation"]))
@@ -77,7 +78,7 @@ class PlayGates(Transform):
         return tensordict.set("action", MultiplicativeGaussian(loc, scale, tensordict["action"]).mean)
 
     def transform_input_spec(self, input_spec: TensorSpec) -> TensorSpec:
-        """Make the action K gates between 0 and 1."""
+        """Replace the action by K gates between 0 and 1."""
         input_spec["full_action_spec", "action"] = Bounded(0.0, 1.0, (*self.parent.batch_size, K))
         return input_spec
 
@@ -105,17 +106,17 @@ def make_actor() -> ProbabilisticActor:
 
 
 def make_critic() -> ValueOperator:
-    """Make a network for the value of gates in a state; layer normalisation keeps it from diverging."""
+    """Make a network for the value of gates in a state, with layer normalisation, without which it would diverge."""
     norm = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": 256}}
     value = MLP(out_features=1, num_cells=[256, 256], activation_class=nn.ReLU, **norm)
     return ValueOperator(value, in_keys=["observation", "goal", "action"])
 
 
 def train(env: TransformedEnv, actor: ProbabilisticActor, *, total_frames: int, random_frames: int) -> Iterator[int]:
-    """Train the actor by soft actor-critic, and yield the number of steps after every update."""
+    """Train the actor by soft actor-critic, and yield the number of environment steps after every batch."""
     critic = make_critic()
     for network in (actor, critic):
-        network(env.fake_tensordict())  # sizes the first layers
+        network(env.fake_tensordict())  # determines the sizes of the first layers
     loss = SACLoss(actor, critic, num_qvalue_nets=2, action_spec=Bounded(0.0, 1.0, (K,)), alpha_init=0.1)
     loss.make_value_estimator(gamma=GAMMA)
     target = SoftUpdate(loss, tau=0.005)
@@ -145,7 +146,17 @@ def train(env: TransformedEnv, actor: ProbabilisticActor, *, total_frames: int, 
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of environment steps (all, random ones, between evaluations), environments and episodes."""
+    """Numbers of environment steps, environments and episodes.
+
+    Attributes:
+        sac: Environment steps of SAC.
+        ppo: Environment steps of PPO.
+        random: Environment steps of SAC with random actions, at the beginning.
+        interval: Environment steps between evaluations of SAC.
+        num_envs: Number of environments.
+        episodes: Number of episodes of an evaluation.
+        environment: Arguments of the environments of evaluations.
+    """
 
     sac: int = 49_152
     ppo: int = 163_840
@@ -162,30 +173,34 @@ QUICK = Size(sac=96, ppo=1024, random=32, interval=64, episodes=2, environment={
 def sac_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
     """Train by SAC, and yield a row for every evaluation."""
     torch.manual_seed(seed)
-    curriculum = {"initial_states": {"rest": 1.0, "motions": 0.5}, "random_first_length": True}  # as PPO's
+    # The curriculum of PPO's training.
+    curriculum = {"initial_states": {"rest": 1.0, "motions": 0.5}, "random_first_length": True}
     env = make_env(size.num_envs, seed, curriculum=curriculum)
-    actor, evaluated, began = make_actor(), 0, time.process_time()
+    actor = make_actor()
+    evaluated = 0
+    began = time.process_time()
     for steps in train(env, actor, total_frames=size.sac, random_frames=size.random):
         if steps - evaluated >= size.interval or steps == size.sac:
-            seconds, evaluated = time.process_time() - began, steps
-            printed = make_env(size.episodes, EVALUATION_SEED, **size.environment)
-            yield {"learner": "SAC", "seed": seed, "steps": steps, **earned(actor, printed, seconds)}
+            seconds = time.process_time() - began
+            evaluated = steps
+            evaluation = make_env(size.episodes, EVALUATION_SEED, **size.environment)
+            yield {"learner": "SAC", "seed": seed, "steps": steps, **earned(actor, evaluation, seconds)}
             began = time.process_time() - seconds  # evaluations do not count
 
 
 def ppo_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
-    """Train by this library's PPO, and yield a row for every checkpoint, with its share of the run's seconds."""
+    """Train by this library's PPO, and yield a row for every checkpoint, with seconds in proportion to its steps."""
     with TemporaryDirectory() as folder, initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         counts = (f"training.total_frames={size.ppo}", f"training.num_envs={size.num_envs}")
         cfg = compose("train", [*PPO.split(), *counts, f"seed={seed}", f"run_dir={folder}/run"])
         began = time.process_time()
         run = experiment.train(cfg)
         seconds = time.process_time() - began
-        printed: Any = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
+        environment: Any = OmegaConf.to_container(cfg.evaluation.environment, resolve=True)
         for path in reversed(run_folder.find_all(run)):
             steps = run_folder.frames(path)
             _, agent, env = policies.restore(
-                path, num_envs=size.episodes, seed=EVALUATION_SEED, **printed | size.environment
+                path, num_envs=size.episodes, seed=EVALUATION_SEED, **environment | size.environment
             )
             policy = agent.actor.policy
             yield {
@@ -197,7 +212,7 @@ def ppo_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
 
 
 def earned(policy: TensorDictModuleBase, env: EnvBase, seconds: float) -> dict[str, Any]:
-    """Return what a policy earns in the first episode of each simulation."""
+    """Return the results of a policy in one episode per environment, with the seconds of its training."""
     numbers = episode_statistics(evaluate(policy, env), env.normalised_return)
     return {
         "cpu_seconds": round(seconds, 1),
@@ -210,7 +225,8 @@ def earned(policy: TensorDictModuleBase, env: EnvBase, seconds: float) -> dict[s
 
 def draw(rows: list[dict[str, Any]]) -> Figure:
     """Draw the returns of all seeds against steps, and against seconds."""
-    figure, learners = new_figure(8.0, 3.4), dict.fromkeys(row["learner"] for row in rows)
+    figure = new_figure(8.0, 3.4)
+    learners = dict.fromkeys(row["learner"] for row in rows)
     for axes, (key, label) in zip(
         figure.subplots(1, 2, sharey=True),
         [("steps", "environment steps"), ("cpu_seconds", "seconds of one core")],
@@ -223,7 +239,7 @@ def draw(rows: list[dict[str, Any]]) -> Figure:
 
 
 def curve(rows: list[dict[str, Any]], learner: str, key: str) -> Curve:
-    """Return a learner's curve over its seeds, which were evaluated at the same steps."""
+    """Return the curve of a learner over its seeds, which are all evaluated at the same steps."""
     groups = groupby(sorted((row for row in rows if row["learner"] == learner), key=by_steps), by_steps)
     points = [[(float(row[key]), float(row["normalised_return"])) for row in group] for _, group in groups]
     x, y = np.array(points).transpose(2, 0, 1)

@@ -1,6 +1,6 @@
-"""Reports of benchmarks: rows as text and as CSV, with a description of the machine.
+"""Writes the rows of benchmarks as text and as CSV, with a description of the machine.
 
-The library is imported inside functions, because benchmarks also run contenders in interpreters without it.
+The library is imported inside functions, because benchmarks also run contenders in interpreters without the library.
 """
 
 import csv
@@ -22,12 +22,12 @@ def about() -> dict[str, Any]:
     for package in PACKAGES:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-    here = Path(__file__).resolve().parent
-    return {"commit": commit(here) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
+    folder = Path(__file__).resolve().parent
+    return {"commit": commit(folder) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return rows with the same keys as text, a line each."""
+    """Return rows with the same keys as a text table."""
     from torchrl_mcp.runs.tables import text_table
 
     return text_table(rows)
@@ -43,7 +43,10 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def peak_memory(pid: int) -> float:
-    """Peak resident memory of a process and its descendants in MiB; pages they share count for each (Linux only)."""
+    """Return the peak resident memory of a process and its descendants in MiB, on Linux.
+
+    Pages that several processes share count for each of them.
+    """
     total = 0.0
     with suppress(OSError):
         for line in Path(f"/proc/{pid}/status").read_text().splitlines():

@@ -1,23 +1,25 @@
-"""How training scales: measured here with environments, threads and workers, predicted for other machines.
+"""Measures how training scales with environments, threads and workers, and predicts its speed on other machines.
 
     python benchmarks/scaling.py            # minutes, writes results/scaling*.csv
-    python benchmarks/scaling.py --quick    # a minute, writes nothing unless given --output
+    python benchmarks/scaling.py --quick    # a minute, writes nothing without --output
     python benchmarks/scaling.py --refit    # seconds, from existing measurements
 
-It measures whole iterations of MCP on the humanoid's heading task with the built-in primitives, in the precision that
-``autocast=auto`` chooses, with one thread, two, and one for every core. What the last reach is printed beside what the
-first two predict: that checks the prediction on this machine. ``*_cpu`` are CPU seconds of all threads: a section in
-which two threads take as long as one, with as much CPU, is serial; one that takes half the time scales; in between,
-threads wait for each other or for Python's lock. ``serial`` is that share by Amdahl's law.
+The script measures whole iterations of MCP on the humanoid's heading task with the built-in primitives, in the
+precision of ``autocast=auto``. It uses one thread, two threads, and one thread for every core. The speed with all cores
+is printed next to the prediction from one and two threads, which checks the prediction on this machine. ``*_cpu`` are
+CPU seconds of all threads. A section is serial if two threads take as much time and CPU as one thread, and scales if
+they take half of the time. In between, threads wait for each other or for Python's lock. ``serial`` is the serial share
+by Amdahl's law.
 
-From the seconds of the sections it fits the constants of a model:
+From the seconds of the sections, the script fits the constants of a model:
 
     iteration = T * (physics * N / speed-up + forward + forward' * N + rest + rest' * N) + update * N * T / speed-up
 
-with ``N`` environments and ``T`` steps of each. Forward pass and rest use one thread. The speed-up of the others on
-more cores is predicted from the gain of a second thread in two ways: by Amdahl's law (low), and with the same gain for
-every further core (high). A GPU runs forward pass and update: it takes the time to launch the operations, which are
-counted here, or the time of their arithmetic if longer, plus the transfers. ``GPU`` has the assumptions.
+with ``N`` environments and ``T`` steps of each. Forward pass and rest use one thread. The speed-up of physics and
+update on more cores is predicted from the gain of a second thread in two ways: by Amdahl's law (low), and with the same
+gain for every further core (high). A GPU computes forward pass and update. Its time is the larger of two times, for
+launching the operations, which are counted, and for their arithmetic; the time of transfers is added. ``GPU`` contains
+the assumptions.
 """
 
 import argparse
@@ -43,15 +45,15 @@ from torchrl_mcp.training.trainer import Trainer
 RESULTS = Path(__file__).resolve().parent / "results" / "scaling.csv"
 SIZES, QUICK_SIZES = (64, 256, 1024, 4096), (16, 64)
 STEPS, ITERATIONS, EPOCHS, MINIBATCH = 8, 2, 2, 512
-"""Control steps and iterations of a measurement, the first one for warm-up; passes over its samples, minibatch."""
+"""Control steps of an iteration; iterations, of which the first is a warm-up; passes over the samples; minibatch."""
 SECTIONS = ("physics", "forward", "collection", "update", "other")
 GPU = {"operations_per_second": 2e5, "flops": 2e13, "seconds_per_transfer": 2e-5}
-"""Assumptions: launches of operations from Python, sustained arithmetic, and a small transfer with synchronisation."""
+"""Assumptions about launches of operations from Python, sustained arithmetic, and small synchronous transfers."""
 MEASURED = ("num_envs", "threads", "workers", "samples_per_second", *(f"{name}_seconds" for name in SECTIONS))
 CPU = tuple(f"{name}_cpu" for name in SECTIONS)
 CORES = os.cpu_count() or 1
 TRANSFERS = 5
-"""Transfers of a control step, as tests/accelerator counts them for this task."""
+"""Number of transfers in a control step of this task, as counted in tests/accelerator."""
 MACHINES = {f"{cores} cores": (cores, False) for cores in sorted({2, 8, 16, 64, CORES})}
 MACHINES |= {f"{cores} cores, GPU": (cores, True) for cores in (8, 64)}
 
@@ -68,7 +70,7 @@ class Operations(TorchDispatchMode):
 
 
 def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
-    """Return the trainer of a measurement, with threads for physics and torch, or workers with one thread each."""
+    """Return the trainer of a measurement, with threads for physics and torch, or with workers of one thread each."""
     collector = f"collector={'processes' if workers else 'local'}"
     settings = {
         "character": "humanoid",
@@ -96,7 +98,7 @@ def make_trainer(num_envs: int, threads: int, workers: int) -> Trainer:
 
 
 class Record:
-    """A metrics writer that keeps metrics in memory."""
+    """A metrics writer that stores metrics in memory."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
@@ -107,15 +109,15 @@ class Record:
 
 
 def measure(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
-    """Return samples per second and the seconds of an iteration's sections, by the wall and of all threads' CPU."""
+    """Return samples per second, and the wall-clock and CPU seconds of an iteration's sections."""
     row = sections(num_envs, threads, workers)
     with patch("time.perf_counter", time.process_time):
-        again = sections(num_envs, threads, workers)
-    return row | {f"{name}_cpu": again[f"{name}_seconds"] for name in SECTIONS}
+        cpu = sections(num_envs, threads, workers)
+    return row | {f"{name}_cpu": cpu[f"{name}_seconds"] for name in SECTIONS}
 
 
 def sections(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
-    """Return samples per second and the seconds of an iteration's sections, without the first iteration."""
+    """Return samples per second and the seconds of an iteration's sections; the first iteration does not count."""
     torch.set_num_threads(threads)
     trainer = make_trainer(num_envs, threads, workers)
     record = Record()
@@ -135,24 +137,30 @@ def sections(num_envs: int, threads: int, workers: int) -> dict[str, Any]:
 
 
 def serial_shares(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return, by section, its share of an iteration on one thread, and what of it a second thread does not speed up."""
-    one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
-    found = []
+    """Return the share of each section in an iteration on one thread, and the serial share of the section."""
+    one = of_threads(rows, 1)
+    two = of_threads(rows, 2)
+    shares_by_section = []
     for name in (name for name in SECTIONS if name != "collection"):
-        shares = [row[f"{name}_seconds"] / sum(row[f"{other}_seconds"] for other in SECTIONS) for row in one]
+        shares = [row[f"{name}_seconds"] / sum(row[f"{section}_seconds"] for section in SECTIONS) for row in one]
         times = [second[f"{name}_seconds"] / first[f"{name}_seconds"] for first, second in zip(one, two, strict=True)]
         serial = float(np.clip(2 * np.median(times) - 1, 0, 1))
-        found.append({"section": name, "share": f"{np.median(shares):.0%}", "serial": f"{serial:.0%}"})
-    return found
+        shares_by_section.append({"section": name, "share": f"{np.median(shares):.0%}", "serial": f"{serial:.0%}"})
+    return shares_by_section
+
+
+def of_threads(rows: list[dict[str, Any]], threads: int) -> list[dict[str, Any]]:
+    """Return the rows that were measured with a number of threads and without workers."""
+    return [row for row in rows if row["threads"] == threads and not row["workers"]]
 
 
 def count() -> dict[str, float]:
     """Return operations, and FLOPs per sample, of the policy's forward pass and of a gradient step."""
-    trainer, counts = make_trainer(MINIBATCH, 1, 0), {}
+    trainer = make_trainer(MINIBATCH, 1, 0)
     batch = trainer.source.env.fake_tensordict().expand(MINIBATCH).clone()
     with torch.no_grad(), Operations() as operations, FlopCounterMode(display=False) as flops:
         trainer.agent.actor.policy(batch)
-    counts |= {"forward_operations": operations.count, "forward_flops": flops.get_total_flops() / MINIBATCH}
+    counts = {"forward_operations": operations.count, "forward_flops": flops.get_total_flops() / MINIBATCH}
     batch = batch.update({"advantage": torch.zeros(MINIBATCH, 1), "value_target": torch.zeros(MINIBATCH, 1)})
     with Operations() as operations, FlopCounterMode(display=False) as flops:
         for name in trainer.update.objective.optimizers:
@@ -162,7 +170,8 @@ def count() -> dict[str, float]:
 
 def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
     """Return the model's constants: seconds per control step and sample on one thread, and a second thread's gain."""
-    one, two = ([row for row in rows if row["threads"] == n and not row["workers"]] for n in (1, 2))
+    one = of_threads(rows, 1)
+    two = of_threads(rows, 2)
     constants: dict[str, float] = {}
     for name in ("forward", "other"):
         sizes = [row["num_envs"] for row in one]
@@ -191,11 +200,12 @@ def predict(num_envs: int, cores: int, gpu: bool, c: dict[str, float], *, linear
     if not gpu:
         forward = STEPS * c["forward_per_step"] + samples * c["forward_per_sample"]
         return round(samples / (physics + rest + forward + samples * c["update_per_sample"] / speed_up("update")))
-    starts, rate = GPU["operations_per_second"], GPU["flops"]
-    forward = STEPS * max(c["forward_operations"] / starts, num_envs * c["forward_flops"] / rate)
+    launches = GPU["operations_per_second"]
+    rate = GPU["flops"]
+    forward = STEPS * max(c["forward_operations"] / launches, num_envs * c["forward_flops"] / rate)
     forward += STEPS * TRANSFERS * GPU["seconds_per_transfer"]
     steps = EPOCHS * max(samples / MINIBATCH, 1)
-    update = steps * max(c["step_operations"] / starts, min(MINIBATCH, samples) * c["step_flops"] / rate)
+    update = steps * max(c["step_operations"] / launches, min(MINIBATCH, samples) * c["step_flops"] / rate)
     return round(samples / (physics + rest + forward + update))
 
 
@@ -235,7 +245,7 @@ def main() -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """Return the measurements of a file."""
+    """Return the measurements in a file."""
     with path.open(newline="") as file:
         return [row | {key: float(row[key]) for key in MEASURED} for row in csv.DictReader(file)]
 

@@ -1,27 +1,28 @@
-r"""Search of settings at equal processor time: every trial of every method trains for the same CPU seconds on one core.
+r"""Searches settings at equal processor time: every trial of every method trains for the same CPU seconds on one core.
 
     python benchmarks/search.py carry mcp --minutes 15
     python benchmarks/search.py dribble latent_space --minutes 40
     python benchmarks/search.py carry mcp --minutes 15 --seeds 100 101 102 103 104 \
         --candidate default= --candidate large="training.num_envs=512 training.frames_per_batch=16384"
 
-Protocol, the same for all methods and tasks, in float32 with the biped:
+The protocol is the same for all methods and tasks, in float32 with the biped:
 
-* A trial is a set of settings, arguments of ``torchrl-mcp-train``, proposed by Optuna's TPE sampler. The first two
-  trials are today's defaults, and the defaults with large batches. Every method has the same number of trials.
-* A trial trains with two seeds, 100 and 101, which no table uses, from one pre-training of the method (5 M steps).
-  A run is stopped by its CPU seconds, counted from its first step on, so that other work does not falsify the
-  comparison. Trials of one study belong on one processor; its name is in each row.
-* After half of the time each seed plays 128 deterministic and 128 exploring episodes of the printed task. Optuna's
-  successive halving (reduction factor 2) ends the trial unless it is in the better half so far. The others train to the
-  end of the time and play again. The first look comes at half, because large batches still score worse than small ones
-  after a quarter, and better at the end.
-* The score is the mean over seeds, deterministic and exploring episodes of success plus normalised return. A task
+* A trial is a set of settings, which are arguments of ``torchrl-mcp-train``. Optuna's TPE sampler proposes the
+  settings, except for the first two trials: the current defaults, and the defaults with large batches. Every method has
+  the same number of trials.
+* A trial trains with the seeds 100 and 101, which no table uses, from one pre-training of the method (5 M steps). A run
+  is stopped after a number of CPU seconds, counted from its first step, so that other work on the machine does not
+  distort the comparison. All trials of a study must run on the same kind of processor, which every row names.
+* After half of the time, each seed plays 128 deterministic and 128 exploring episodes of the paper's task. Optuna's
+  successive halving (reduction factor 2) ends the trial unless it is in the better half so far. Other trials train to
+  the end and are evaluated again. An earlier first evaluation would be unfair: after a quarter of the time, large
+  batches score worse than small batches, but at the end they score better.
+* The score is success plus normalised return, averaged over seeds and over deterministic and exploring episodes. A task
   without success is scored by its return alone.
 
-Repeated, the command goes on with the trials that are missing. With candidates, it trains these alone, to the end, with
-every seed, in a table of their own. Optuna 4 or newer does not go with Hydra's plugin: install it in an environment of
-its own.
+Re-running the command continues with the missing trials. With candidates, the script trains only the candidates, for
+the whole time and with every seed, and writes a separate table. Optuna 4 or newer is incompatible with Hydra's plugin:
+install Optuna in a separate environment.
 """
 
 import argparse
@@ -40,7 +41,7 @@ from statistics import mean
 from typing import Any
 
 SEEDS = (100, 101)
-"""Seeds of the trials; tables use seeds from 0 on."""
+"""Seeds of the trials. Tables use seeds from 0."""
 
 EVALUATION_SEED = "777"
 EPISODES = "128"
@@ -59,19 +60,19 @@ STEPS_PER_CHECKPOINT = 65_536
 TICKS = os.sysconf("SC_CLK_TCK")
 
 BATCHES = {"1024": (32, 1024), "4096": (128, 4096), "16384": (512, 16_384)}
-"""Environments and steps of a batch."""
+"""Numbers of environments and of steps per batch, by the size of the batch."""
 
 CHOICES = {"8192": (32, 1024), "32768": (128, 4096), "131072": (512, 16_384)}
 """The same for the hierarchical model, whose batches are eight times as large as ``training.frames_per_batch``."""
 
 
 def suggest(trial: Any, method: str) -> list[str]:
-    """Return the settings of a trial; the first two, which are known, are not proposed by the sampler."""
-    known = trial.user_attrs.get("known")
-    if known == "default":
+    """Return the settings of a trial, which the sampler proposes except for the first two trials."""
+    fixed = trial.user_attrs.get("known")
+    if fixed == "default":
         return []
     batches = CHOICES if method == "hierarchical" else BATCHES
-    if known == "large":
+    if fixed == "large":
         return batch_words(*list(batches.values())[-1], minibatches=8, passes=4)
     chosen = batches[trial.suggest_categorical("batch", list(batches))]
     words = batch_words(
@@ -88,7 +89,7 @@ def suggest(trial: Any, method: str) -> list[str]:
 
 
 def batch_words(num_envs: int, frames: int, *, minibatches: int, passes: int) -> list[str]:
-    """Return the settings of a batch."""
+    """Return the settings for a batch."""
     return [
         f"training.num_envs={num_envs}",
         f"training.frames_per_batch={frames}",
@@ -128,15 +129,20 @@ NOISE = {
     "hierarchical": {"means": "exploration=weights", "samples": "exploration=action"},
     "option_critic": {f"{share} random": f"epsilon={share}" for share in (0.05, 0.1, 0.2)},
 }
-"""What explores, and with how much noise, as settings by name."""
+"""Settings of exploration by name, for every method."""
 
 
 class Training:
-    """A training in a process of its own, which is stopped between its stretches of CPU seconds."""
+    """A training in a separate process, which stands still between the periods in which it may train.
+
+    Args:
+        words: Arguments of ``torchrl-mcp-train``.
+        folder: The run folder.
+    """
 
     def __init__(self, words: Sequence[str], folder: Path) -> None:
         self.folder = folder
-        shutil.rmtree(folder, ignore_errors=True)  # of an interrupted trial
+        shutil.rmtree(folder, ignore_errors=True)  # remains of an interrupted trial
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.log = folder.with_suffix(".log").open("w")
         program = Path(sys.executable).with_name("torchrl-mcp-train")
@@ -145,17 +151,17 @@ class Training:
         self.began = 0.0
 
     def train_to(self, seconds: float) -> float:
-        """Train until this many CPU seconds in all, and return those taken.
+        """Train until the training has used ``seconds`` of CPU time in total, and return the CPU seconds used.
 
         Raises:
-            ChildProcessError: If the training ends by itself.
+            ChildProcessError: If the training ends before.
         """
         self.process.send_signal(signal.SIGCONT)
         used = 0.0
         while used < seconds:
             time.sleep(1)
             if self.process.poll() is not None:
-                raise ChildProcessError(f"{' '.join(self.command)} ended by itself, see {self.log.name}")
+                raise ChildProcessError(f"{' '.join(self.command)} ended early, see {self.log.name}")
             if not (self.folder / "config.yaml").exists():
                 self.began = cpu_seconds(self.process.pid)
             used = cpu_seconds(self.process.pid) - self.began
@@ -163,7 +169,7 @@ class Training:
         return used
 
     def end(self) -> None:
-        """End the process, and remove the checkpoints."""
+        """End the process, and close its log."""
         self.process.kill()
         self.process.wait()
         self.log.close()
@@ -176,7 +182,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 def scored(training: Training, seconds: float) -> dict[str, Any]:
-    """Train until this many CPU seconds, evaluate the newest checkpoint, and return the numbers."""
+    """Train until the training has used ``seconds`` of CPU time, evaluate the newest checkpoint, and return numbers."""
     used = training.train_to(seconds)
     output = training.folder / f"search-{seconds:.0f}.json"
     program = Path(sys.executable).with_name("torchrl-mcp-evaluate")
@@ -200,7 +206,7 @@ def scored(training: Training, seconds: float) -> dict[str, Any]:
 
 
 def settings_of(task: str, method: str) -> list[str]:
-    """Return the settings of all trials of a method in a task."""
+    """Return the settings that all trials of a method in a task share."""
     pretrained = [] if method == "scratch" else [f"pretrained={PRETRAINED / f'{method}-biped-0.torchrl'}"]
     return [f"task={task}", f"method={method}", *pretrained]
 
@@ -214,13 +220,13 @@ def processor() -> str:
 
 
 def search(task: str, method: str, root: Path, results: Path, *, seconds: float, trials: int) -> None:
-    """Search, and write a row for each run of each trial after each stretch.
+    """Search, and write a row after each evaluation of a run.
 
     Args:
         task: Name of the task.
         method: Name of the method.
         root: Folder of the runs.
-        results: Folder of tables, and of Optuna's journal, from which the search goes on.
+        results: Folder of tables and of Optuna's journal, with which an interrupted search continues.
         seconds: CPU seconds of a run.
         trials: Number of trials.
     """
@@ -238,29 +244,29 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
         pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=2, min_early_stopping_rate=0),
     )
     for trial in study.trials:
-        if trial.state == optuna.trial.TrialState.RUNNING:  # of an interrupted search
+        if trial.state == optuna.trial.TrialState.RUNNING:  # the search was interrupted during this trial
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
             if trial.params:
                 study.enqueue_trial(trial.params)
     tried = {trial.user_attrs.get("known") for trial in study.trials if trial.state.name != "FAIL"}
-    for known in ("default", "large"):
-        if known not in tried:
-            study.enqueue_trial({}, user_attrs={"known": known})
+    for fixed in ("default", "large"):
+        if fixed not in tried:
+            study.enqueue_trial({}, user_attrs={"known": fixed})
     table = Table(results / f"{name}.csv")
 
     def objective(trial: Any) -> float:
-        own = suggest(trial, method)
+        settings = suggest(trial, method)
         score = 0.0
         trainings: list[Training] = []
         try:
             for seed in SEEDS:
-                words = [*settings_of(task, method), f"seed={seed}", interval(own), *own]
+                words = [*settings_of(task, method), f"seed={seed}", interval(settings), *settings]
                 trainings.append(Training(words, root / name / f"trial-{trial.number:02}-seed{seed}"))
-                table.write(trial.number, seed, own, scored(trainings[-1], seconds / 2))
-            for step, stretch in ((1, seconds / 2), (2, seconds)):
+                table.write(trial.number, seed, settings, scored(trainings[-1], seconds / 2))
+            for step, used in ((1, seconds / 2), (2, seconds)):
                 if step > 1:
                     for seed, training in zip(SEEDS, trainings, strict=True):
-                        table.write(trial.number, seed, own, scored(training, stretch))
+                        table.write(trial.number, seed, settings, scored(training, used))
                 score = table.score(trial.number)
                 trial.report(score, step)
                 if step == 1 and trial.should_prune():
@@ -270,12 +276,12 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
                 training.end()
         return score
 
-    left = trials - sum(trial.state.name in ("COMPLETE", "PRUNED") for trial in study.trials)
-    study.optimize(objective, n_trials=max(0, left), catch=(ChildProcessError, subprocess.CalledProcessError))
+    remaining = trials - sum(trial.state.name in ("COMPLETE", "PRUNED") for trial in study.trials)
+    study.optimize(objective, n_trials=max(0, remaining), catch=(ChildProcessError, subprocess.CalledProcessError))
 
 
 def interval(words: Sequence[str]) -> str:
-    """Return the setting of the checkpoints of a run with these settings, as seldom as all others' in steps."""
+    """Return the checkpoint interval in iterations for which all runs have the same number of steps per checkpoint."""
     frames = next((int(word.partition("=")[2]) for word in words if "frames_per_batch" in word), 4096)
     return f"checkpoint_interval={max(1, STEPS_PER_CHECKPOINT // frames)}"
 
@@ -290,23 +296,23 @@ def compare(
     seconds: float,
     seeds: Sequence[int],
 ) -> None:
-    """Train candidates to the end with every seed, and write a row for each run; rows that are there stay."""
+    """Train candidates for the whole time with every seed, and write a row for each run that has no row yet."""
     table = Table(results / f"{task}-{method}-candidates.csv")
     for seed in seeds:
-        for name, settings in candidates.items():
-            own = settings.split()
-            if table.holds(name, seed, own, seconds):
+        for name, arguments in candidates.items():
+            settings = arguments.split()
+            if table.contains(name, seed, settings, seconds):
                 continue
-            words = [*settings_of(task, method), f"seed={seed}", interval(own), *own]
+            words = [*settings_of(task, method), f"seed={seed}", interval(settings), *settings]
             training = Training(words, root / f"{task}-{method}" / f"{name}-seed{seed}")
             try:
-                table.write(name, seed, own, scored(training, seconds))
+                table.write(name, seed, settings, scored(training, seconds))
             finally:
                 training.end()
 
 
 class Table:
-    """Rows of runs in a CSV file."""
+    """The rows of runs in a CSV file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -323,19 +329,22 @@ class Table:
             writer.writerows(self.rows)
 
     def score(self, trial: int) -> float:
-        """Return the mean score of a trial's seeds after its last stretch."""
+        """Return the mean score of a trial's seeds in its last evaluation."""
         newest = {row["seed"]: float(row["score"]) for row in self.rows if row["trial"] == str(trial)}
         return mean(newest.values())
 
-    def holds(self, trial: str, seed: int, settings: Sequence[str], seconds: float) -> bool:
-        """Return whether there is a row of a run.
+    def contains(self, trial: str, seed: int, settings: Sequence[str], seconds: float) -> bool:
+        """Return whether the table contains a row of a run.
 
         Raises:
             SystemExit: If a row of the trial and seed has other settings or fewer CPU seconds.
         """
         rows = [row for row in self.rows if row["trial"] == trial and row["seed"] == str(seed)]
         if any(row["settings"] != " ".join(settings) or float(row["cpu_seconds"]) < seconds for row in rows):
-            raise SystemExit(f"{self.path} has other settings or seconds of {trial}: remove the rows, or rename it")
+            raise SystemExit(
+                f"{self.path} has rows of {trial} with other settings or seconds: remove these rows, or rename the "
+                "candidate"
+            )
         return bool(rows)
 
 
@@ -346,19 +355,21 @@ def main(argv: Sequence[str] | None = None, run: Callable[..., None] = search) -
     parser.add_argument("method")
     parser.add_argument("--minutes", type=float, required=True, help="CPU minutes of a trial")
     parser.add_argument("--trials", type=int, default=6)
-    parser.add_argument("--candidate", action="append", default=[], metavar="NAME=SETTINGS", help="instead of a search")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="of candidates")
+    parser.add_argument(
+        "--candidate", action="append", default=[], metavar="NAME=SETTINGS", help="train these settings, do not search"
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS), help="seeds of candidates")
     parser.add_argument("--root", type=Path, default=Path("runs/search"), help="folder of the runs")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
     arguments = parser.parse_args(argv)
     arguments.results.mkdir(parents=True, exist_ok=True)
-    place = (arguments.task, arguments.method, arguments.root, arguments.results)
+    study = (arguments.task, arguments.method, arguments.root, arguments.results)
     seconds = 60 * arguments.minutes
     if arguments.candidate:
         candidates = dict(one.split("=", 1) for one in arguments.candidate)
-        compare(*place, candidates, seconds=seconds, seeds=arguments.seeds)
+        compare(*study, candidates, seconds=seconds, seeds=arguments.seeds)
     else:
-        run(*place, seconds=seconds, trials=arguments.trials)
+        run(*study, seconds=seconds, trials=arguments.trials)
 
 
 if __name__ == "__main__":

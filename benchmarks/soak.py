@@ -1,4 +1,4 @@
-"""Deliberate faults: kills and full disks in training, damaged checkpoints, and unfit actions.
+"""Tests the library with deliberate faults: kills and full disks in training, damaged checkpoints, invalid actions.
 
     python benchmarks/soak.py training    # 50 minutes, writes results/soak_training.csv
     python benchmarks/soak.py flips       # a minute, writes results/soak_flips.csv
@@ -6,20 +6,24 @@
 
 ``--quick`` takes fewer steps, and writes a file only with ``--output``.
 
-*training*: runs use a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180 seconds.
-If this user may not mount one, files cannot grow at those times (``RLIMIT_FSIZE``). The main process alone gets
-SIGKILL after one to three minutes. A run that has ended is resumed until it is complete; then another run begins, until
-the time is over. ``slowest_end_s``: seconds until the last process of a killed run was gone. ``wrong``: rows with a
-wrong step or a loss that is not finite, and steps that the csv logger lacks or has twice. ``changed``: rows before a
-checkpoint that changed in a resume. ``differing``: rows and contents of the last checkpoint that differ in any bit from
-those of an undisturbed run (for ``collector=local`` only, because workers begin new episodes).
+*training*: Runs use a file system of 16 MB in memory, which is full for 5 to 15 seconds after every 90 to 180 seconds.
+If this user is not permitted to mount one, files cannot grow at these times (``RLIMIT_FSIZE``). The main process
+receives SIGKILL after one to three minutes, its workers do not. A run that has ended is resumed until it is complete.
+Then another run begins, until the time is over. Columns:
 
-*flips*: one random bit of a checkpoint is inverted. ``harmless``: accepted, with unchanged contents.
+- ``slowest_end_s``: seconds until the last process of a killed run had ended
+- ``wrong``: rows with a wrong step or a loss that is not finite, and steps that the csv logger lacks or has twice
+- ``changed``: rows before a checkpoint that changed when the run was resumed
+- ``differing``: rows, and members of the last checkpoint, that differ in any bit from an undisturbed run. Only
+  ``collector=local`` has a number, because workers begin new episodes
 
-*steps*: a third of the simulations gets targets drawn uniformly within their bounds, a third also magnitudes up to 1e12
-and infinity, and a third also NaN. ``unfit`` actions are not finite or beyond MuJoCo's limit, and must end their
-episode with reward 0; ``missed`` counts those that did not. ``diverged``: divergences after all other actions.
-``not_finite``: outputs that are not finite.
+*flips*: One random bit of a checkpoint is inverted. ``harmless`` counts files that were accepted with unchanged
+contents.
+
+*steps*: A third of the simulations receive targets drawn uniformly within their bounds, a third also receive magnitudes
+up to 1e12 and infinity, and a third also receive NaN. ``unfit`` counts actions that are not finite or beyond MuJoCo's
+limit. These must end their episode with reward 0; ``missed`` counts those that do not. ``diverged`` counts divergences
+after all other actions, and ``not_finite`` counts outputs that are not finite.
 """
 
 import argparse
@@ -58,7 +62,12 @@ KILL = (60.0, 180.0)
 
 
 def attempt(settings: list[str], disk: Disk, log: Path, due: Callable[[], bool]) -> tuple[str, float]:
-    """Run training until it ends, or is due to be killed; return how it ended, and the seconds until it was gone."""
+    """Run training until it ends or ``due`` returns True, and then kill it.
+
+    Returns:
+        How the training ended: ``killed``, ``done``, ``disk_full`` or its last line of output. The seconds until its
+        last process had ended.
+    """
     with log.open("wb") as file:
         process = subprocess.Popen([*TRAIN, *settings], stdout=file, stderr=file, start_new_session=True)
     while process.poll() is None and not due():
@@ -70,14 +79,14 @@ def attempt(settings: list[str], disk: Disk, log: Path, due: Callable[[], bool])
     began = time.monotonic()
     while any(_group(stat) == process.pid for stat in Path("/proc").glob("[0-9]*/stat")):
         time.sleep(0.05)
-    said = log.read_text(errors="replace").strip().rpartition("\n")[2]
-    full = any(text in said for text in ("No space left", "File too large"))
-    how = "killed" if killed else "done" if not process.returncode else "disk_full" if full else said
-    return how, time.monotonic() - began
+    last_line = log.read_text(errors="replace").strip().rpartition("\n")[2]
+    full = any(text in last_line for text in ("No space left", "File too large"))
+    end = "killed" if killed else "done" if not process.returncode else "disk_full" if full else last_line
+    return end, time.monotonic() - began
 
 
 def _group(stat: Path) -> int:
-    """Return the process group of a living process, or 0."""
+    """Return the process group of a living process, or 0 for an ended one."""
     with suppress(OSError):
         state, _, group = stat.read_text().rpartition(")")[2].split()[:3]
         return 0 if state == "Z" else int(group)
@@ -93,29 +102,32 @@ def _saved(folder: Path) -> bool:
 
 
 def disturbed(folder: Path, settings: list[str], disk: Disk, log: Path, quick: bool) -> dict[str, Any]:
-    """Train, and resume after each interruption, until the run is complete."""
+    """Train, and resume after each interruption, until the run is complete; return the columns of a row."""
     ends: Counter[str] = Counter()
-    slowest, changed, before, began = 0.0, 0, [], time.monotonic()
+    slowest = 0.0
+    changed = 0
+    before: list[dict[str, str]] = []
+    began = time.monotonic()
     while not ends["done"]:
         begun = (folder / run_folder.CONFIG).exists()
-        if quick:  # once, after its first checkpoint
+        if quick:  # kill the run only once, after its first checkpoint
             due = (lambda: False) if ends["killed"] else partial(_saved, folder)
         else:
             due = partial(_past, time.monotonic() + random.uniform(*KILL))
-        how, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, due)
-        if how not in ("killed", "disk_full", "done"):
+        end, seconds = attempt([f"resume={folder}"] if begun else settings, disk, log, due)
+        if end not in ("killed", "disk_full", "done"):
             print(log.read_text(errors="replace")[-3000:], flush=True)
-        ends[how] += 1
+        ends[end] += 1
         slowest = max(slowest, seconds)
         now = rows(folder)
         changed += sum(old != new for old, new in zip(before, now, strict=False)) + max(len(before) - len(now), 0)
         saved = max((run_folder.frames(path) for path in run_folder.find_all(folder)), default=0)
         before = [row for row in now if row["frames"] and int(row["frames"]) <= saved]
-    known = {how: ends.pop(how, 0) for how in ("killed", "disk_full", "done")}
+    expected = {end: ends.pop(end, 0) for end in ("killed", "disk_full", "done")}
     minutes = round((time.monotonic() - began) / 60, 1)
     return {
         "minutes": minutes,
-        **known,
+        **expected,
         "other_ends": ends.total(),
         "slowest_end_s": round(slowest, 1),
         "changed": changed,
@@ -134,11 +146,12 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def wrong(folder: Path, total: int) -> int:
     """Count wrong steps in metrics and log, and losses that are not finite."""
-    steps, found = [str(frames) for frames in range(BATCH, total + 1, BATCH)], rows(folder)
+    expected = [str(frames) for frames in range(BATCH, total + 1, BATCH)]
+    metrics = rows(folder)
     logged = [line.partition(",")[0] for line in (folder / "csv/scalars/reward.csv").read_text().splitlines()]
-    lists = ([row["frames"] for row in found], logged)
-    misplaced = sum(step != other for others in lists for step, other in zip_longest(steps, others))
-    losses = (float(value) for row in found for name, value in row.items() if name.startswith("loss/"))
+    recorded = ([row["frames"] for row in metrics], logged)
+    misplaced = sum(step != frames for steps in recorded for step, frames in zip_longest(expected, steps))
+    losses = (float(value) for row in metrics for name, value in row.items() if name.startswith("loss/"))
     return misplaced + sum(not math.isfinite(loss) for loss in losses)
 
 
@@ -158,16 +171,17 @@ def training(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for seed in count():
         common = [*SETTINGS, f"seed={seed}", f"training.total_frames={total}"]
         with small_disk(0.1 if args.quick else 1.0) as (folder, disk), tempfile.TemporaryDirectory() as calm:
-            whole, log = Path(calm) / "whole", Path(calm) / "log"
+            undisturbed = Path(calm) / "whole"
+            log = Path(calm) / "log"
             if "local" in args.collectors:
-                subprocess.run([*TRAIN, *common, f"run_dir={whole}"], check=True, stdout=subprocess.DEVNULL)
+                subprocess.run([*TRAIN, *common, f"run_dir={undisturbed}"], check=True, stdout=subprocess.DEVNULL)
             for collector in args.collectors:
                 run = folder / collector
                 settings = [*common, f"collector={collector}", f"run_dir={run}"]
                 row = {"collector": collector, "seed": seed, "frames": total, "disk": disk.kind}
                 row |= disturbed(run, settings, disk, log, args.quick)
                 row |= {"rows": len(rows(run)), "wrong": wrong(run, total)}
-                yield row | {"differing": differing(whole, run) if collector == "local" else ""}
+                yield row | {"differing": differing(undisturbed, run) if collector == "local" else ""}
                 shutil.rmtree(run)
         if args.quick or time.monotonic() > end:
             return
@@ -176,27 +190,30 @@ def training(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def main() -> None:
     """Run the chosen test, print and write its rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["training", "flips", "steps"])
-    parser.add_argument("--minutes", type=float, default=50.0, help="of training (default 50)")
-    parser.add_argument("--frames", type=int, default=200 * BATCH, help=f"of each run (default {200 * BATCH:,})")
-    parser.add_argument("--flips", type=int, default=1000, help="bits (default 1000)")
+    parser.add_argument("test", choices=["training", "flips", "steps"])
+    parser.add_argument("--minutes", type=float, default=50.0, help="minutes of training (default 50)")
+    parser.add_argument("--frames", type=int, default=200 * BATCH, help=f"steps of each run (default {200 * BATCH:,})")
+    parser.add_argument("--flips", type=int, default=1000, help="number of inverted bits (default 1000)")
     parser.add_argument("--steps", type=int, default=10_000_000, help="control steps (default 10,000,000)")
     sources = ["local", "processes"]
-    parser.add_argument("--collectors", nargs="+", choices=sources, default=sources, help="of training (default both)")
+    parser.add_argument(
+        "--collectors", nargs="+", choices=sources, default=sources, help="collectors of training (default both)"
+    )
     tasks = sorted({task for task, _ in TASKS})
-    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks, help="of the steps (default all)")
-    parser.add_argument("--threads", type=int, default=2, help="of the physics of steps (default 2)")
+    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks, help="tasks of steps (default all)")
+    parser.add_argument("--threads", type=int, default=2, help="physics threads of steps (default 2)")
     parser.add_argument("--quick", action="store_true", help="do less")
     parser.add_argument("--output", type=Path, help="CSV file; without --quick there is a default")
     args = parser.parse_args()
-    output = args.output or (None if args.quick else RESULTS / f"soak_{args.what}.csv")
+    output = args.output or (None if args.quick else RESULTS / f"soak_{args.test}.csv")
     output = output and output.resolve()
     random.seed(0)
-    conditions, measured = {"command": " ".join(["python", *sys.argv]), **about()}, []
-    for row in {"training": training, "flips": flips, "steps": steps}[args.what](args):
+    conditions = {"command": " ".join(["python", *sys.argv]), **about()}
+    measured = []
+    for row in {"training": training, "flips": flips, "steps": steps}[args.test](args):
         print(table([row]), flush=True)
         measured.append({**row, **conditions})
-        if output:  # after each row, so that an interruption loses nothing
+        if output:  # after each row, so that an interruption loses no rows
             write(output, measured)
 
 

@@ -1,4 +1,4 @@
-"""A small disk that is full from time to time, for ``soak.py``."""
+"""Makes a small disk that is full from time to time, for ``soak.py``."""
 
 import random
 import resource
@@ -14,17 +14,24 @@ FULL, FREE = (5.0, 15.0), (90.0, 180.0)
 
 
 class Disk:
-    """A small disk that is full from time to time."""
+    """A small disk that is full from time to time.
+
+    Args:
+        folder: Folder at which the disk is mounted.
+        pace: Factor on all durations.
+    """
 
     def __init__(self, folder: Path, pace: float) -> None:
         mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)]
         self.mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
         self.kind = "tmpfs of 16 MB" if self.mounted else "RLIMIT_FSIZE"
-        self._filler, self._pace = folder / "filler", pace
-        self._full, self._next = False, time.monotonic() + pace * random.uniform(*FREE)
+        self._filler = folder / "filler"
+        self._pace = pace
+        self._full = False
+        self._next = time.monotonic() + pace * random.uniform(*FREE)
 
     def pass_time(self, process: "subprocess.Popen[bytes]") -> None:
-        """Fill or empty the disk, if it is time to."""
+        """Fill or empty the disk if it is time to do so; without a mounted disk, limit the files of the process."""
         if time.monotonic() < self._next:
             return
         self._full = not self._full

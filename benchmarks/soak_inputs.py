@@ -1,4 +1,4 @@
-"""Damaged checkpoints and unfit actions, for ``soak.py``."""
+"""Tests damaged checkpoints and invalid actions, for ``soak.py``."""
 
 import argparse
 import math
@@ -28,7 +28,7 @@ TASKS = [("holdout", "ant"), *product(("imitation", "heading", "carry", "dribble
 
 
 def contents(path: Path) -> Mapping[str, bytes]:
-    """Return the members of a checkpoint, except times and random number generators."""
+    """Return the members of a checkpoint, except for times and random generators."""
     with ZipFile(path) as archive:
         names = [
             name for name in archive.namelist() if not re.match(r"manifest|components/\d+-(progress|random)", name)
@@ -37,13 +37,15 @@ def contents(path: Path) -> Mapping[str, bytes]:
 
 
 def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Damage a checkpoint, and try to read it for a resume and for an evaluation."""
+    """Damage a checkpoint, try to read it for a resume and for an evaluation, and yield a row for each."""
     with tempfile.TemporaryDirectory() as name:
         cfg = configuration.compose_run(*SMALL, f"run_dir={name}/run", "logger=none", "progress_bar=false")
-        path, copy = checkpoint.find(experiment.train(cfg)), Path(name) / "damaged.torchrl"
+        path = checkpoint.find(experiment.train(cfg))
+        copy = Path(name) / "damaged.torchrl"
         _, agent, _ = policies.restore(path, num_envs=1, seed=0)
-        whole = {key: value.clone() for key, value in agent.parts.state_dict().items()}
-        original, results = path.read_bytes(), {check: Counter[str]() for check in ("resume", "evaluate")}
+        intact_values = {key: value.clone() for key, value in agent.parts.state_dict().items()}
+        original = path.read_bytes()
+        results = {check: Counter[str]() for check in ("resume", "evaluate")}
         for _ in range(20 if args.quick else args.flips):
             data = bytearray(original)
             data[random.randrange(len(data))] ^= 1 << random.randrange(8)
@@ -57,7 +59,7 @@ def flips(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
             except ValueError:
                 results["evaluate"]["refused"] += 1
                 continue
-            same = all(torch.equal(value, whole[key]) for key, value in agent.parts.state_dict().items())
+            same = all(torch.equal(value, intact_values[key]) for key, value in agent.parts.state_dict().items())
             results["evaluate"][outcome(same)] += 1
     for check, tally in results.items():
         counts = {name: tally[name] for name in ("refused", "harmless", "accepted_wrongly")}
@@ -70,15 +72,19 @@ def outcome(same: bool) -> str:
 
 
 def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Play unfit actions in all tasks with all characters."""
-    os.chdir(tempfile.mkdtemp())  # where MuJoCo writes its warnings
-    num_envs, total = (6, 60 * len(TASKS)) if args.quick else (768, args.steps)
+    """Play invalid actions in all tasks with all characters, and yield a row for each pair."""
+    os.chdir(tempfile.mkdtemp())  # MuJoCo writes its warnings to the working directory
+    num_envs = 6 if args.quick else 768
+    total = 60 * len(TASKS) if args.quick else args.steps
     chosen = [(task, character) for task, character in TASKS if task in args.tasks]
     for task, character in chosen:
         stage = "pretrain" if task in ("holdout", "imitation") else "transfer"
         cfg = configuration.compose_run(f"task={task}", f"character={character}", f"stage={stage}")
         env = build.make_env(cfg, num_envs=num_envs, seed=0, num_threads=args.threads)
-        generator, tally, before, began = torch.Generator().manual_seed(0), Counter[str](), warned(), time.monotonic()
+        generator = torch.Generator().manual_seed(0)
+        tally = Counter[str]()
+        before = warned()
+        began = time.monotonic()
         state = env.reset()
         with warnings.catch_warnings(record=True) as complaints:
             warnings.simplefilter("always")
@@ -97,7 +103,8 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 )
         seconds = time.monotonic() - began
         tally["diverged"] = env.num_diverged - tally["unfit"]
-        tally["mujoco_warnings"], tally["python_warnings"] = warned() - before, len(complaints)
+        tally["mujoco_warnings"] = warned() - before
+        tally["python_warnings"] = len(complaints)
         names = ("steps", "episodes", "unfit", "missed", "diverged", "not_finite", "mujoco_warnings", "python_warnings")
         yield {"task": task, "character": character, **{name: tally[name] for name in names}} | {
             "steps_per_second": round(tally["steps"] / seconds)
@@ -105,7 +112,7 @@ def steps(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def actions(low: torch.Tensor, high: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Draw actions: within the bounds, of any magnitude, and with NaN, each for a third of the simulations."""
+    """Draw actions within the bounds, of any magnitude, and with NaN, each for a third of the simulations."""
     third = len(low) // 3
     drawn = low + (high - low) * torch.rand(low.shape, generator=generator)
     sizes = 10 ** (12 * torch.rand(third, 1, generator=generator))

@@ -1,15 +1,20 @@
-"""Table 2: the runs of the seven methods, archived, with their tables, picture and learning curves.
+"""Archives the runs of Table 2, and writes tables, pictures and learning curves of the seven methods.
 
     torchrl-mcp-train benchmark=table2 preset=comparison run_root=runs/table2
     python benchmarks/table2.py runs/table2    # archives the complete runs, and writes the results
     python benchmarks/table2.py                # writes the results again, from the archive
 
-Everything lands in ``results/table2``. ``runs.tar.xz`` has the run folders without checkpoints, and of their metrics
-only the columns of learning curves; ``torchrl-mcp-report`` reads it unpacked. ``table.md`` is Table 2 with our results,
-``summary.md`` its short form for the README, ``table_2.png`` the picture of the report, and ``over_rows.png`` has
-interquartile means over the rows and the probability that MCP is ahead. Each row has a table, ``TASK_CHARACTER.md``,
-and learning curves; ``imitation_CHARACTER`` and ``holdout_ant_pretrain`` have those of pre-training. ``runs.csv`` has
-the command, the commit and the machine of every run.
+The script writes to ``results/table2``:
+
+- ``runs.tar.xz``: the run folders without checkpoints, and with the metrics of learning curves only. After unpacking,
+  ``torchrl-mcp-report`` can read them
+- ``table.md``: Table 2 with our results
+- ``summary.md``: a short form of this table for the README
+- ``table_2.png``: the picture of the report
+- ``over_rows.png``: interquartile means over the rows, and the probability that MCP is ahead
+- ``TASK_CHARACTER.md`` and pictures of the same name: a table and learning curves for each row. The files
+  ``imitation_CHARACTER`` and ``holdout_ant_pretrain`` show pre-training
+- ``runs.csv``: the command, the commit and the machine of every run
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,26 +35,26 @@ SHORT = "Scratch, short"
 
 def main() -> None:
     """Archive runs if a folder is given, and write the results of the archive."""
-    with archived(__doc__, RESULTS) as (found, output):
-        for name, rows in (("table", list(table_2(found))), ("summary", list(summary(found)))):
+    with archived(__doc__, RESULTS) as (groups, output):
+        for name, rows in (("table", list(table_2(groups))), ("summary", list(summary(groups)))):
             table = text_table(rows, markdown=True)
             (output / f"{name}.md").write_text(table + "\n")
             print(table, end="\n\n")
-        for name, picture in (("table_2", draw_table_2(found)), ("over_rows", draw_over_rows(found))):
+        for name, picture in (("table_2", draw_table_2(groups)), ("over_rows", draw_over_rows(groups))):
             if picture:
                 save_figure(picture, output / name)
-        write_tables(found, output)
+        write_tables(groups, output)
 
 
-def table_2(found: Sequence[Cell]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of Table 2: ours with the number of seeds, and the paper's below.
+def table_2(groups: Sequence[Cell]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of Table 2: our returns with the number of seeds, and the paper's returns below them.
 
-    Scratch has two columns: its longest runs, and those with as many steps as the other methods.
+    Scratch has two columns: its longest runs, and its runs with as many steps as the other methods.
     """
     for place in PLACES:
-        chosen = {TITLES[name]: cell for name, cell in compared(found, place).items() if name in TITLES}
-        here = [cell for cell in found if cell.place == place and cell.stage == "transfer"]
-        short = [cell for cell in here if cell.method == "scratch" and is_short(cell, here)]
+        chosen = {TITLES[name]: cell for name, cell in compared(groups, place).items() if name in TITLES}
+        of_task = [cell for cell in groups if cell.place == place and cell.stage == "transfer"]
+        short = [cell for cell in of_task if cell.method == "scratch" and is_short(cell, of_task)]
         columns = {"Scratch": chosen.pop("Scratch", None), SHORT: next(iter(short), None)}
         columns |= {title: chosen.get(title) for title in list(TITLES.values())[1:]}
         paper = {title: TABLE_2[*place, name].mean for name, title in TITLES.items() if (*place, name) in TABLE_2}
@@ -57,18 +62,19 @@ def table_2(found: Sequence[Cell]) -> Iterator[dict[str, Any]]:
         yield {"": "*paper*"} | {title: f"*{paper[title]:.3f}*" if title in paper else EMPTY for title in columns}
 
 
-def summary(found: Sequence[Cell]) -> Iterator[dict[str, Any]]:
+def summary(groups: Sequence[Cell]) -> Iterator[dict[str, Any]]:
     """Yield the rows of the README's table: MCP, the best other method that pre-trains, scratch, the paper's MCP."""
     for place in PLACES:
-        chosen = compared(found, place)
-        mcp, scratch = chosen.pop("mcp", None), chosen.pop("scratch", None)
-        other = max(chosen.values(), key=average, default=None)
-        named = f"{TITLES.get(other.method, other.title)} " if other else EMPTY
-        cells = (mcp, other, scratch)
+        chosen = compared(groups, place)
+        mcp = chosen.pop("mcp", None)
+        scratch = chosen.pop("scratch", None)
+        rival = max(chosen.values(), key=average, default=None)
+        title = f"{TITLES.get(rival.method, rival.title)} " if rival else EMPTY
+        cells = (mcp, rival, scratch)
         yield {
             "": row_title(place),
             "MCP": brief(mcp),
-            "best other that pre-trains": f"{named}{brief(other)}",
+            "best other that pre-trains": f"{title}{brief(rival)}",
             "scratch, all steps": brief(scratch),
             "paper's MCP": f"{TABLE_2[*place, 'mcp'].mean:.3f}",
             "seeds": ", ".join(str(len(cell.by_seed)) if cell else "0" for cell in cells) if mcp else EMPTY,

@@ -1,19 +1,19 @@
-"""Environment steps per second of every task with every character, beside bare MuJoCo in the same scene.
+"""Measures environment steps per second of every task with every character, and of bare MuJoCo in the same scene.
 
     python benchmarks/task_throughput.py            # a quarter of an hour, writes results/task_throughput.csv
-    python benchmarks/task_throughput.py --quick    # seconds, writes nothing unless given --output
+    python benchmarks/task_throughput.py --quick    # seconds, writes nothing without --output
 
-``ours`` calls TorchRL's ``step_and_maybe_reset``. ``raw`` is ``mujoco.batch`` with the scene's model: it replays the
-same controls from the same states with the same physics steps, updates kinematics as the tasks need them, and copies
-the initial states of new episodes, so that both compute the same physics. Characters act at random; in imitation they
-use the built-in policy, exploring as in training, so that episodes last as long as there. The policy's time is
-excluded.
+``ours`` calls TorchRL's ``step_and_maybe_reset``. ``raw`` is ``mujoco.batch`` with the model of the scene. To compute
+the same physics, ``raw`` replays the same controls from the same states with the same physics steps, updates the
+kinematics that tasks need, and copies the initial states of new episodes. Characters act at random. In imitation, they
+use the built-in policy with the exploration of training, so that episodes last as long as in training. The time of the
+policy does not count.
 
-Both have one torch thread and all processors for physics, and take turns of a few steps each. The fastest turn
-counts, because other work on the machine only slows turns down: ``of_raw`` is the ratio of the two speeds. ``physics``
-is the share of our time inside MuJoCo in that turn, ``resets`` the mean number of new episodes in a step.
-``memory_kib`` is the resident memory per simulation: the process's memory with simulations less its memory without,
-divided by their number. Every pair has its own process.
+Both have one torch thread and all cores for physics, and take turns of a few steps each. The fastest turn counts,
+because other work on the machine only slows turns down. ``of_raw`` is the ratio of the two speeds, ``physics`` the
+share of our time inside MuJoCo in that turn, and ``resets`` the mean number of new episodes in a step. ``memory_kib``
+is the resident memory per simulation: the memory that the process needs in addition for the simulations, divided by
+their number. Every pair of task and character has a separate process.
 """
 
 import argparse
@@ -50,20 +50,20 @@ TASKS, SIZES = ("Heading", "Carry", "Dribble", "Imitation"), (256, 1024)
 AIMS = {256: 0.9, 1024: 0.95}
 AIMS_OF_IMITATION = {256: 0.85, 1024: 0.9}
 PARTS = ("qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat")
-"""Parts of the state of a simulation, if the scene has them."""
+"""Parts of the state of a simulation, some of which a scene may lack."""
 
 Step = tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
 """Controls ``(N, A)``, the ``n`` simulations with a new episode, and their initial states, each ``(n, ...)``."""
 
 
 def resident() -> float:
-    """Resident memory of this process in KiB."""
+    """Return the resident memory of this process in KiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1024
 
 
 def make(task: str, character: str, **kwargs: Any) -> envs.PDCharacterEnv:
-    """Environments of a task; imitation uses the generated corpus and the reward of its configuration."""
+    """Return environments of a task; imitation uses the generated motions and the reward of its configuration."""
     if task != "Imitation":
         return getattr(envs, task)(character=character, **kwargs)
     cfg = compose_run("task=imitation", f"character={character}")
@@ -79,11 +79,14 @@ class Ours:
     """
 
     def __init__(self, env: envs.PDCharacterEnv, act: Callable[[TensorDictBase], TensorDictBase]) -> None:
-        self.env, self.act, self.state = env, act, env.reset()
+        self.env = env
+        self.act = act
+        self.state = env.reset()
 
     def turn(self, steps: int) -> tuple[float, dict[str, np.ndarray], list[Step]]:
-        """Take steps; return the seconds in the environment, the state before the steps, and the record of each."""
-        seconds, done = 0.0, []
+        """Take steps; return the seconds in the environment, the state before the steps, and a record of each step."""
+        seconds = 0.0
+        done = []
         physics = {key: value for key, value in self.env.simulation.state.items() if key in PARTS}
         before = {key: value.numpy().copy() for key, value in physics.items()}
         for _ in range(steps):
@@ -98,14 +101,15 @@ class Ours:
 
 
 class Raw:
-    """MuJoCo alone in the scene of a task."""
+    """Replays the steps of a task with bare MuJoCo."""
 
     def __init__(self, env: envs.PDCharacterEnv, threads: int) -> None:
-        self.batch, self.substeps = Batch(env.simulation.model, env.num_envs, threads, True), env.substeps
+        self.batch = Batch(env.simulation.model, env.num_envs, threads, True)
+        self.substeps = env.substeps
         self.parts = {key: self.batch.bind(key) for key in ("ctrl", *PARTS)}
 
     def turn(self, before: dict[str, np.ndarray], done: list[Step]) -> float:
-        """Replay our steps; return the seconds."""
+        """Replay our steps, and return the seconds."""
         for key, value in before.items():
             self.parts[key][:] = value
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -141,10 +145,11 @@ def measure(task: str, character: str, num_envs: int, turns: int, steps: int, th
     ours = Ours(env, act)
     memory = (resident() - before) / num_envs
     raw = Raw(env, threads)
-    for _ in range(15 if task == "Imitation" else 5):  # warm up; episodes of imitation spread over their lengths
+    for _ in range(15 if task == "Imitation" else 5):  # warm-up, in which episodes of imitation reach various lengths
         ours.turn(steps)
     seconds: dict[str, list[float]] = {"raw": [], "ours": []}
-    physics, resets = [], 0
+    physics = []
+    resets = 0
     for _ in range(turns + 1):
         inside = env.physics_seconds
         spent, start, done = ours.turn(steps)
@@ -152,7 +157,7 @@ def measure(task: str, character: str, num_envs: int, turns: int, steps: int, th
         seconds["ours"].append(spent)
         seconds["raw"].append(raw.turn(start, done))
         resets += sum(len(ended) for _, ended, _ in done)
-    fastest = {name: min(values[1:]) for name, values in seconds.items()}  # the first turn warms up
+    fastest = {name: min(values[1:]) for name, values in seconds.items()}  # the first turn is a warm-up
     return {
         "task": task,
         "character": character,

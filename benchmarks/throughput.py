@@ -1,21 +1,21 @@
-"""Environment steps per second: ours beside bare MuJoCo, Gymnasium, EnvPool and TorchRL's own environments.
+"""Measures environment steps per second of this library, bare MuJoCo, Gymnasium, EnvPool and TorchRL.
 
     python benchmarks/throughput.py            # about five minutes, writes results/throughput_env.csv
-    python benchmarks/throughput.py --quick    # about one, writes nothing unless given --output
+    python benchmarks/throughput.py --quick    # about a minute, writes nothing without --output
     python benchmarks/throughput.py --distributions    # half a minute, writes results/throughput_distributions.csv
 
 Every contender simulates Ant-v5 (5 physics steps per action, without contact observations and costs unless stated),
-acts at random and resets fallen ants. Each has its own process. In a turn they are measured one after the other, round
-after round, so that a busy machine slows all of them; a speed is the median over rounds, a ratio the median of the
-rounds' ratios. Compare only speeds of the same turn.
+acts at random and resets fallen ants. Each contender has a separate process. In a turn, all contenders are measured one
+after the other, round after round, so that a busy machine slows all of them. A speed is the median over rounds, and a
+ratio is the median of the ratios of all rounds. Only speeds of the same turn are comparable.
 
-Environments with a process each are measured with one process, with one per processor, and Gymnasium's with 64; a loop
-in Python does not get faster with more. EnvPool is measured if it is installed; ``--envpool-python`` sets an
-interpreter with EnvPool.
+Contenders with one process per environment are measured with one process and with one per core; Gymnasium's also with
+64 processes. A loop in Python does not become faster with more environments. EnvPool is measured if it is installed;
+``--envpool-python`` sets an interpreter that has EnvPool.
 
-With ``--distributions``, each contender draws actions with their log-probabilities instead, on one thread: 256 states,
-8 primitives and 28 actions, from given primitives and gates. Their clock is the processor's time. ``--before`` sets
-another clone, whose product is measured beside.
+With ``--distributions``, each contender draws actions with their log-probabilities instead, on one thread, from given
+primitives and gates: 256 states, 8 primitives and 28 actions. The measured time is processor time. ``--before`` sets
+another clone of this repository, whose product distribution is also measured.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def actions(num_envs: int) -> np.ndarray:
 
 
 def raw(num_envs: int) -> Step:
-    """``mujoco.batch`` with minimal random actions and resets: the upper limit."""
+    """Return the steps of ``mujoco.batch`` with minimal random actions and resets, which is the upper limit."""
     import mujoco
     from mujoco.batch import Batch
 
@@ -73,7 +73,7 @@ def raw(num_envs: int) -> Step:
 
 
 def ours(num_envs: int, contact_forces: bool = False) -> Step:
-    """Holdout, through TorchRL's ``step_and_maybe_reset``."""
+    """Return the steps of holdout, through TorchRL's ``step_and_maybe_reset``."""
     import torch
 
     from torchrl_mcp.envs import Holdout
@@ -84,10 +84,11 @@ def ours(num_envs: int, contact_forces: bool = False) -> Step:
 
 
 def stepping(env: Any, script: np.ndarray) -> Step:
-    """Steps of a TorchRL environment."""
+    """Return the steps of a TorchRL environment."""
     import torch
 
-    carrier, acting = env.reset(), torch.from_numpy(script).reshape(32, *env.action_spec.shape)
+    carrier = env.reset()
+    acting = torch.from_numpy(script).reshape(32, *env.action_spec.shape)
 
     def step(index: int) -> None:
         nonlocal carrier
@@ -97,7 +98,7 @@ def stepping(env: Any, script: np.ndarray) -> Step:
 
 
 def gymnasium(num_envs: int, mode: str) -> Step:
-    """Gymnasium's vector environments; a Python process, or a loop in one, per ant."""
+    """Return the steps of Gymnasium's vector environments, with a process per ant or with a loop in one process."""
     import gymnasium as gym
 
     env = gym.make_vec("Ant-v5", num_envs, vectorization_mode=mode, **ANT)
@@ -107,7 +108,7 @@ def gymnasium(num_envs: int, mode: str) -> Step:
 
 
 def envpool(num_envs: int) -> Step:
-    """EnvPool's C++ thread pool."""
+    """Return the steps of EnvPool's C++ thread pool."""
     import envpool as pool
 
     off = {"use_contact_force": False, "contact_cost_weight": 0.0, "post_constraint": False}
@@ -118,14 +119,17 @@ def envpool(num_envs: int) -> Step:
 
 
 def torchrl_parallel(num_envs: int) -> Step:
-    """TorchRL's ParallelEnv over Gymnasium's Ant-v5; a process per ant."""
+    """Return the steps of TorchRL's ParallelEnv over Gymnasium's Ant-v5, with a process per ant."""
     from torchrl.envs import GymEnv, ParallelEnv
 
     return stepping(ParallelEnv(num_envs, partial(GymEnv, "Ant-v5", **ANT)), actions(num_envs))
 
 
 def torchrl_ant(num_envs: int, integrator: str = "Euler") -> Step:
-    """TorchRL's AntEnv on C MuJoCo; a process per ant. Its default is Euler, a quarter of the work of Ant-v5's RK4."""
+    """Return the steps of TorchRL's AntEnv on C MuJoCo, with a process per ant.
+
+    The default integrator, Euler, needs a quarter of the work of Ant-v5's RK4.
+    """
     from torchrl.envs import AntEnv
 
     class Ant(AntEnv):
@@ -153,7 +157,7 @@ CONTENDERS: dict[str, tuple[Callable[[int], Step], tuple[int, ...]]] = {
 
 
 def drawing(num_states: int, distribution: str, *, compiled: bool = False) -> Step:
-    """Draw an action with its log-probability in each state."""
+    """Return a function that draws an action with its log-probability in each state."""
     import torch
     from torchrl.modules import IndependentNormal
 
@@ -161,7 +165,8 @@ def drawing(num_states: int, distribution: str, *, compiled: bool = False) -> St
 
     torch.set_num_threads(1)
     loc = torch.randn(num_states, 8, 28)
-    scale, gates = torch.rand_like(loc) + 0.1, torch.rand(num_states, 8)
+    scale = torch.rand_like(loc) + 0.1
+    gates = torch.rand(num_states, 8)
     single = distribution == "IndependentNormal"
     parameters = (loc[:, 0].contiguous(), scale[:, 0].contiguous()) if single else (loc, scale, gates)
     make = IndependentNormal if single else getattr(distributions, distribution)
@@ -185,12 +190,13 @@ DRAWING = {
     "MultiplicativeGaussian, compiled": partial(drawing, distribution="MultiplicativeGaussian", compiled=True),
     "AdditiveGaussian, compiled": partial(drawing, distribution="AdditiveGaussian", compiled=True),
 }
-"""Constructors of what draws actions."""
+"""Functions that make the contenders which draw actions."""
 
 
 def worker(name: str, num_envs: int) -> None:
-    """Set a contender up, then time it for the seconds in each line of standard input."""
-    step, index = {**{name: make for name, (make, _) in CONTENDERS.items()}, **DRAWING}[name](num_envs), 0
+    """Make a contender, and measure its speed for as many seconds as each line of standard input says."""
+    step = {**{name: make for name, (make, _) in CONTENDERS.items()}, **DRAWING}[name](num_envs)
+    index = 0
     until = time.perf_counter() + 0.3  # warm up, and let the first ants fall
     while index < 20 or time.perf_counter() < until:
         step(index)
@@ -198,19 +204,20 @@ def worker(name: str, num_envs: int) -> None:
     print(json.dumps({"ready": True}), flush=True)
     clock = time.process_time if name in DRAWING else time.perf_counter
     for line in sys.stdin:
-        start, first = clock(), index
+        start = clock()
+        first = index
         while clock() - start < float(line):
             step(index)
             index += 1
         speed = (index - first) * num_envs / (clock() - start)
         print(json.dumps({"speed": speed, "memory": peak_memory(os.getpid())}), flush=True)
-    os._exit(0)  # closing tens of environments in order takes longer than measuring them
+    os._exit(0)  # an orderly end of many environments takes longer than the measurement
 
 
 def measure(
     sizes: dict[str, int], envpool_python: str, rounds: int, seconds: float, before: Path | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Measure contenders in turns, each with its number of environments."""
+    """Measure contenders in turns, each with its number of environments, and yield their rows."""
     processes = {}
     for name, num_envs in sizes.items():
         python = envpool_python if name == "EnvPool" else sys.executable
@@ -236,7 +243,7 @@ def measure(
 
 
 def answer(process: subprocess.Popen, line: str = "") -> dict[str, Any]:
-    """Send a line to a worker and read its answer, the next line of JSON; empty if the worker failed."""
+    """Send a line to a worker, and return its answer, the next line of JSON; empty if the worker failed."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(BrokenPipeError):
@@ -245,13 +252,13 @@ def answer(process: subprocess.Popen, line: str = "") -> dict[str, Any]:
     return next((json.loads(line) for line in process.stdout if line.startswith("{")), {})
 
 
-def ratio(row: dict[str, Any], other: dict[str, Any]) -> float:
-    """Median over rounds of the ratio of two contenders' speeds."""
-    return median(a / b for a, b in zip(row["speeds"], other["speeds"], strict=True))
+def ratio(row: dict[str, Any], reference: dict[str, Any]) -> float:
+    """Return the median over rounds of the ratio of two contenders' speeds."""
+    return median(a / b for a, b in zip(row["speeds"], reference["speeds"], strict=True))
 
 
 def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Compare the speeds of a turn with the aims."""
+    """Yield lines that compare the speeds of a turn with our aims."""
     for size in sorted({row["turn"] for row in rows if row["turn"] >= 256}):
         turn = {row["contender"]: row for row in rows if row["turn"] == size}
         aimed = {"mujoco.batch": 0.95, "EnvPool": 1, "Gymnasium sync": 2.5, "Gymnasium async": 2.5}
@@ -263,7 +270,7 @@ def aims(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the line of a contender in the table."""
+    """Return the row of a contender in the table."""
     return {
         **{key: row[key] for key in ("turn", "contender", "num_envs")},
         "steps_per_second": round(median(row["speeds"])),
@@ -277,7 +284,8 @@ def line(row: dict[str, Any], facts: dict[str, Any]) -> dict[str, Any]:
 
 def measure_distributions(before: Path | None, output: Path) -> None:
     """Measure, print and write the time of an action with its log-probability in 256 states."""
-    facts, num_states = about(), 256
+    facts = about()
+    num_states = 256
     sizes = {name: num_states for name in DRAWING if name != BEFORE or before}
     rows = list(measure(sizes, sys.executable, rounds=15, seconds=0.15, before=before))
     normal = next(row for row in rows if row["contender"] == "IndependentNormal")
@@ -300,7 +308,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="sizes 64 and 256, fewer rounds")
     parser.add_argument("--envpool-python", default=sys.executable, help="interpreter that has EnvPool")
     parser.add_argument("--distributions", action="store_true", help="measure distributions instead")
-    parser.add_argument("--before", type=Path, metavar="CLONE", help="another clone, for --distributions")
+    parser.add_argument("--before", type=Path, metavar="CLONE", help="clone of another version, for --distributions")
     parser.add_argument("--output", type=Path, help=f"CSV file; without --quick it is {RESULTS.name} by default")
     parser.add_argument("--worker", nargs=2, metavar=("NAME", "NUM_ENVS"), help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -311,14 +319,16 @@ def main() -> None:
         return
 
     rounds, seconds = (3, 0.7) if args.quick else (5, 1.0)
-    facts, rows = about(), []
+    facts = about()
+    rows = []
     print(" | ".join(f"{key} {value}" for key, value in facts.items()))
     for turn in (1, 2) if args.quick else range(len(SIZES)):
         sizes = {name: counts[turn] for name, (_, counts) in CONTENDERS.items()}
         new = list(measure(sizes, args.envpool_python, rounds, seconds))
         limit = next(row for row in new if row["contender"] == "mujoco.batch")
         for row in new:
-            row["turn"], row["of_limit"] = SIZES[turn], ratio(row, limit)
+            row["turn"] = SIZES[turn]
+            row["of_limit"] = ratio(row, limit)
         print(table([line(row, {}) for row in new]), flush=True)
         rows += new
     print("\n".join(aims(rows)))

@@ -1,19 +1,19 @@
-"""Training samples per second, end to end on the CPU: ours beside Stable-Baselines3's PPO.
+"""Measures training samples per second on the CPU, end to end, of this library and of Stable-Baselines3's PPO.
 
     pip install -c constraints.txt stable-baselines3    # adds this one package, changes no other
     python benchmarks/training_throughput.py            # minutes, writes results/training_throughput.csv
-    python benchmarks/training_throughput.py --quick    # seconds, writes nothing unless given --output
+    python benchmarks/training_throughput.py --quick    # seconds, writes nothing without --output
 
 Both train Gymnasium's Ant-v5 without contact forces, and the time includes the whole iteration: acting, physics,
 resets, advantages, gradient steps, metrics. Policy and value networks (1024-512, ReLU, separate), initial standard
 deviation, frames per iteration, minibatch and epochs (of preset=fast), step size and number of threads are the same.
-The rest is each library's default: ours has a goal, standardises its inputs and takes fused Adam steps.
+Everything else is each library's default: this library has a goal, standardises inputs and takes fused Adam steps.
 
-A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` measures others than the default.
-With ``--before PYTHON``, an interpreter with another version of this library, ``before-METHOD-PRECISION`` is that
-version, for comparison with this one. Each contender has its own process, in which the first iteration is not counted.
-They then take turns, one iteration each per round, while the others wait, so that a busy machine slows all of them. A
-speed is the median over rounds, a ratio the median of the rounds' ratios.
+A contender is ``ours-METHOD-PRECISION`` or ``sb3-VECENV-NUM_ENVS``; ``--contenders`` selects contenders. With
+``--before PYTHON``, an interpreter with another version of this library, ``before-METHOD-PRECISION`` measures that
+version. Each contender has a separate process, in which the first iteration does not count. The contenders then take
+turns, one iteration each per round, while the others wait, so that a busy machine slows all of them. A speed is the
+median over rounds, and a ratio is the median of the ratios of all rounds.
 """
 
 import argparse
@@ -53,21 +53,21 @@ def composed(*overrides: str) -> DictConfig:
 
 
 class Turns:
-    """The worker's side: an iteration begins at a line of standard input and ends with a line of JSON."""
+    """Turns of a worker: an iteration begins with a line of standard input, and ends with a line of JSON."""
 
     def begin(self) -> None:
-        """Wait for a line; at the end of the input, exit."""
+        """Wait for a line, or exit at the end of the input."""
         if not sys.stdin.readline():
             raise SystemExit
         self.start = time.perf_counter()
 
     def end(self, shares: dict[str, float]) -> None:
-        """Report the iteration, with the shares of its sections."""
+        """Report seconds, memory and shares of sections of the iteration."""
         seconds = time.perf_counter() - self.start
         print(json.dumps({"seconds": seconds, "memory": peak_memory(os.getpid()), "shares": shares}), flush=True)
 
     def log_metrics(self, metrics: dict[str, float], step: int) -> None:
-        """End the turn; the trainer calls it as a logger, when an iteration is complete."""
+        """End the turn. The trainer calls this method like a logger after each iteration."""
         self.end({section: metrics[f"time/{section}"] for section in SECTIONS})
         self.begin()
 
@@ -103,7 +103,7 @@ def ours(method: str, precision: str, training: dict[str, int]) -> None:
 
 
 def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
-    """Train with Stable-Baselines3 and its ``DummyVecEnv`` (a loop) or ``SubprocVecEnv`` (a process per ant)."""
+    """Train with Stable-Baselines3, with ``DummyVecEnv`` (a loop) or ``SubprocVecEnv`` (a process per ant)."""
     from math import log
 
     from stable_baselines3 import PPO
@@ -135,7 +135,8 @@ def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
         env_kwargs={"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0},
         vec_env_cls=classes[vec_env],
     )
-    cells, std = [1024, 512], composed("method=scratch").parts.policy.std
+    cells = [1024, 512]
+    std = composed("method=scratch").parts.policy.std
     ppo = PPO(
         "MlpPolicy",
         env,
@@ -151,7 +152,7 @@ def sb3(vec_env: str, num_envs: str, training: dict[str, int]) -> None:
 
 
 def worker(name: str, training: dict[str, int], threads: int) -> None:
-    """Train as the named contender."""
+    """Train as a contender."""
     import torch
 
     torch.set_num_threads(threads)
@@ -160,7 +161,7 @@ def worker(name: str, training: dict[str, int], threads: int) -> None:
 
 
 def iterate(name: str, process: subprocess.Popen) -> Iteration:
-    """Let the named contender take one iteration, and return its report."""
+    """Let a contender take one iteration, and return its report."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(BrokenPipeError):
@@ -175,14 +176,16 @@ def iterate(name: str, process: subprocess.Popen) -> Iteration:
 def measure(
     contenders: list[str], training: dict[str, int], threads: int, rounds: int, before: str
 ) -> dict[str, list[Iteration]]:
-    """Return every contender's iterations, one per round; ``before`` is the interpreter for ``before-...`` ones."""
+    """Return every contender's iterations, one per round; ``before`` is the interpreter of ``before-...``."""
     processes: dict[str, subprocess.Popen] = {}
-    pipe, settings = subprocess.PIPE, ["--threads", str(threads), "--worker", json.dumps(training)]
+    pipe = subprocess.PIPE
+    settings = ["--threads", str(threads), "--worker", json.dumps(training)]
     with TemporaryDirectory() as folder:
         try:
             for name in contenders:
                 python = before if name.startswith("before") else sys.executable
-                command, home = [python, str(SCRIPT), *settings, name], Path(folder, name)
+                command = [python, str(SCRIPT), *settings, name]
+                home = Path(folder, name)
                 home.mkdir()
                 processes[name] = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=home)
                 iterate(name, processes[name])
@@ -202,7 +205,7 @@ def summaries(iterations: dict[str, list[Iteration]], frames: int) -> list[dict[
     best = min((name for name in seconds if name.startswith("sb3")), key=lambda name: median(seconds[name]), default="")
     rows = []
     for name, entries in iterations.items():
-        ratios = [rival / own for own, rival in zip(seconds[name], seconds.get(best, []), strict=False)]
+        ratios = [rival / ours for ours, rival in zip(seconds[name], seconds.get(best, []), strict=False)]
         shares = [entry["shares"] for entry in entries]
         rows.append(
             {
@@ -219,12 +222,12 @@ def summaries(iterations: dict[str, list[Iteration]], frames: int) -> list[dict[
 
 
 def available(contenders: list[str]) -> list[str]:
-    """Leave out contenders that are not installed, with a message."""
+    """Return the contenders that are installed, and print a message for all others."""
     if importlib.util.find_spec("stable_baselines3"):
         return contenders
     for name in contenders:
         if name.startswith("sb3"):
-            print(f"{name}: skipped, for stable-baselines3 is not installed")
+            print(f"{name}: skipped, because stable-baselines3 is not installed")
     return [name for name in contenders if not name.startswith("sb3")]
 
 
@@ -234,7 +237,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small batches, fewer contenders and rounds")
     parser.add_argument("--contenders", nargs="+", metavar="NAME")
     parser.add_argument(
-        "--before", default=sys.executable, metavar="PYTHON", help="interpreter of before-... contenders"
+        "--before", default=sys.executable, metavar="PYTHON", help="interpreter of contenders before-..."
     )
     parser.add_argument("--rounds", type=int, help="iterations of every contender")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads of every contender")

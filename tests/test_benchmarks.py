@@ -69,7 +69,7 @@ def test_stable_baselines3_is_left_out_and_named_where_it_is_not_installed(monke
     available = runpy.run_path(str(BENCHMARKS / "training_throughput.py"))["available"]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert available(["ours-mcp-fp32", "sb3-dummy-4"]) == ["ours-mcp-fp32"]
-    assert capsys.readouterr().out == "sb3-dummy-4: skipped, for stable-baselines3 is not installed\n"
+    assert capsys.readouterr().out == "sb3-dummy-4: skipped, because stable-baselines3 is not installed\n"
 
 
 def test_what_a_return_can_reach_is_measured_for_every_task(tmp_path):

@@ -67,7 +67,7 @@ def test_an_evaluation_in_other_episodes_than_configured_is_remarked(write_run):
     planned = {"evaluation__episodes": 128, "evaluation__seed": 12345}
     runs = [write_run(f"{seed}", seed=seed, score=0.5, episodes=32, **planned) for seed in range(2)]
     (cell,) = grouped(*runs)
-    assert cell.remarks == ["seeds 0, 1 evaluated in 32 episodes of seed 12345, which training would not do"]
+    assert cell.remarks == ["seeds 0, 1 evaluated in 32 episodes of seed 12345, unlike after training"]
 
 
 def test_an_evaluation_in_another_task_than_configured_is_remarked(write_run):
@@ -78,7 +78,7 @@ def test_an_evaluation_in_another_task_than_configured_is_remarked(write_run):
     (cell,) = grouped(*runs)
     assert cell.remarks == [
         "seeds 0, 1 evaluated in 128 episodes of seed 12345 with success_reward=True with place.high=2.0, "
-        "which training would not do"
+        "unlike after training"
     ]
 
 

@@ -53,7 +53,7 @@ def damage(path):
 
 def test_a_run_that_is_at_work_is_shown_as_running_and_nobody_joins_in(killed, tmp_path):
     before = contents(killed)
-    with lock.held(killed):
+    with lock.hold(killed):
         assert status(killed).state == "running"
         for join_in in (lambda: experiment.resume(killed), lambda: experiment.train(configure(killed))):
             refused(join_in, f"process {os.getpid()}")

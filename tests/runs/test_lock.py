@@ -21,7 +21,7 @@ POSIX_ONLY = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tt
 HOLDER = """
 import pathlib, sys
 from torchrl_mcp.runs import lock
-with lock.held(pathlib.Path(sys.argv[1])):
+with lock.hold(pathlib.Path(sys.argv[1])):
     print(flush=True)
     input()
 """
@@ -58,11 +58,11 @@ def other(tmp_path):
 def test_a_lock_is_held_by_one_who_is_named_until_that_process_dies(other, tmp_path):
     run = tmp_path / "run"
     assert lock.holder(run) == f"process {other.pid} on {socket.gethostname()}"
-    refused(lambda: lock.held(run).__enter__(), f"process {other.pid}")
+    refused(lambda: lock.hold(run).__enter__(), f"process {other.pid}")
     other.kill()
     other.wait()
     assert lock.holder(run) is None
-    with lock.held(run):
+    with lock.hold(run):
         assert lock.holder(run) == f"process {os.getpid()} on {socket.gethostname()}"
     assert lock.holder(run) is None
 
@@ -70,17 +70,17 @@ def test_a_lock_is_held_by_one_who_is_named_until_that_process_dies(other, tmp_p
 @pytest.mark.parametrize("end", ["kill", "communicate"])
 def test_a_lock_that_is_waited_for_is_one_that_others_see(other, tmp_path, end):
     threading.Timer(2.5, getattr(other, end)).start()  # whoever is not killed removes the file
-    with lock.held(tmp_path / "run", wait=True):
+    with lock.hold(tmp_path / "run", wait=True):
         assert other.wait() != 0
         assert lock.holder(tmp_path / "run") == f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def test_folders_that_stay_empty_do_not_stay(tmp_path):
     (tmp_path / "old").mkdir()
-    with lock.held(tmp_path / "old" / "new" / "run"):
+    with lock.hold(tmp_path / "old" / "new" / "run"):
         pass
     assert list((tmp_path / "old").iterdir()) == []
-    with lock.held(tmp_path / "run"):
+    with lock.hold(tmp_path / "run"):
         (tmp_path / "run" / "config.yaml").touch()
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.yaml"]
 
@@ -96,7 +96,7 @@ def test_who_looks_takes_a_lock_that_a_file_opened_for_reading_may_have_over_nfs
         real(file, operation)
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with lock.held(tmp_path):
+    with lock.hold(tmp_path):
         assert lock.holder(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
     assert lock.holder(tmp_path) is None
 
@@ -113,14 +113,14 @@ def test_who_looks_does_not_keep_the_one_who_comes_out(tmp_path):
         watcher.start()
     try:
         for _ in range(50):
-            with lock.held(tmp_path / "run"):
+            with lock.hold(tmp_path / "run"):
                 pass
     finally:
         ended.set()
 
 
 def test_on_windows_a_lock_is_held_by_the_one_who_took_it_and_who_that_is_can_be_read(windows, tmp_path):
-    with windows.held(tmp_path):
+    with windows.hold(tmp_path):
         assert (tmp_path / windows.LOCK).read_text().startswith("process ")
         assert windows.holder(tmp_path).startswith("process ")
     assert windows.holder(tmp_path) is None

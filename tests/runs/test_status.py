@@ -37,7 +37,7 @@ def runs(tmp_path):
     alive = make_run(tmp_path / "alive", frames=400)
     planned = {tmp_path / name: 1000 for name in ("finished", "killed", "alive", "later")}
     write_manifest(planned, tmp_path / "multirun" / "benchmark-x.json")
-    with lock.held(alive):
+    with lock.hold(alive):
         yield tmp_path
 
 

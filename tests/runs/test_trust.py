@@ -9,7 +9,7 @@ import pytest
 from refusals import refused
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs.trust import GET_CLASS, known, read_config, require_trusted, trusting
+from torchrl_mcp.runs.trust import GET_CLASS, library_names, read_config, require_trusted, trusting
 
 FILE = Path("stranger/config.yaml")
 
@@ -22,8 +22,8 @@ def test_what_may_be_built_is_what_the_files_of_the_library_name():
     lines = [line for path in Path(conf.__file__).parent.rglob("*.yaml") for line in path.read_text().splitlines()]
     named = {name for line in lines for name in re.findall(r"_target_: ([\w.]+)", line)}
     classes = {name for line in lines for name in re.findall(rf"{GET_CLASS}, path: ([\w.]+)", line)}
-    assert known() == (named | classes) - {"torchrl_mcp.commands.sweep.Sweep"}  # of Hydra, which no run has
-    assert {"torch.optim.Adam", "torchrl_mcp.envs.Heading", "torch.nn.Sigmoid"} < known()
+    assert library_names() == (named | classes) - {"torchrl_mcp.commands.sweep.Sweep"}  # of Hydra, which no run has
+    assert {"torch.optim.Adam", "torchrl_mcp.envs.Heading", "torch.nn.Sigmoid"} < library_names()
 
 
 @pytest.mark.parametrize(

@@ -371,7 +371,7 @@ FAULTS = {
         ('reports["actor"][-per_epoch:]', 'reports["actor"]', "training/test_update.py"),
         ('- 1 + mean["kl_approx"]', '- 1 - mean["kl_approx"]', "training/test_update.py"),
         (
-            'if not abs(value) < float("inf")',
+            "if not math.isfinite(value)",
             "if False",
             "training/test_trainer.py::test_a_number_that_is_not_finite_stops_the_run_by_name_and_keeps_the_last_good_checkpoint",
         ),
@@ -482,7 +482,7 @@ FAULTS = {
         ('*origin.get("extended", []), entry', "entry", LONGER),
     ],
     "torchrl_mcp/runs/lock.py": [
-        ("or not _is_there(file, folder)", "", "runs/test_lock.py"),
+        ("or not _is_current(file, folder)", "", "runs/test_lock.py"),
         ("    if wait:\n        return False\n", "", "runs/test_lock.py"),
     ],
     "torchrl_mcp/runs/benchmark.py": [
@@ -507,7 +507,7 @@ FAULTS = {
             "runs/test_benchmark.py::test_settings_that_folders_do_not_tell_apart_are_not_varied",
         ),
         (
-            "if unknown := [value for value in choices[key] if value not in known]",
+            "if unknown := [value for value in choices[key] if value not in available]",
             "if unknown := []",
             "runs/test_benchmark.py::test_arguments_that_fit_no_row_are_refused_with_the_rows",
         ),
@@ -535,7 +535,7 @@ FAULTS = {
             "if False and total <",
             "runs/test_faults.py::test_a_resume_to_the_length_that_was_planned_ends_a_run_of_whole_batches",
         ),
-        ("if None not in (now, began) and now != began", "if False", BODY),
+        ("if None not in (current, recorded) and current != recorded", "if False", BODY),
     ],
     "torchrl_mcp/runs/places.py": [("member.CRC) for member", "member.file_size) for member", NETWORKS)],
     # Validation of settings
@@ -561,7 +561,7 @@ FAULTS = {
         ('if name not in ("defaults", "hydra", *cfg)]', "if False]", KEY),
     ],
     "torchrl_mcp/runs/requirements.py": [
-        ("if able and character not in able", "if False", "runs/test_remedies.py"),
+        ("if characters and character not in characters", "if False", "runs/test_remedies.py"),
         (
             "if unknown and not any(map(_is_open, taken.values()))",
             "if False",

@@ -100,7 +100,7 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
 @pytest.mark.parametrize(("source", "written"), [(LocalSource, "processes or ray"), (RemoteSource, "local")])
 def test_a_source_refuses_the_state_of_another_kind(source, written):
     state = {"starts": 1} if source is LocalSource else {"env": {}}
-    with pytest.raises(ValueError, match=f"written with collector={written}: resume with the same collector"):
+    with pytest.raises(ValueError, match=f"collector={written}: resume with the same collector"):
         source.load_state_dict(object.__new__(source), state)
 
 

@@ -55,11 +55,11 @@ def test_turns_add_up_and_stay_between_plus_and_minus_pi():
     assert steering.target_direction == pytest.approx(-math.pi / 2)
 
 
-def test_let_go_the_direction_wanders_again():
+def test_after_release_all_the_direction_wanders_again():
     steering = idle(Heading, max_turn=0.15)
     steering.aim(1.0)
     steering.step()
-    steering.let_go()
+    steering.release_all()
     steering.step()
     assert 0 < abs(target(steering) - 1.0) <= 0.15
 
@@ -139,7 +139,7 @@ def test_a_character_is_sent_to_a_place_and_stops_where_it_is():
     here = env.com[0, :2].tolist()
     steering.step()
     assert env.episode["target"][0].tolist() == here
-    steering.let_go()
+    steering.release_all()
     steering.step()
     assert env.episode["target"][0].tolist() != here
 
@@ -189,7 +189,7 @@ def test_a_user_who_sets_the_direction_or_the_speed_has_both_in_hand_until_letti
             steering.step()
             goals.add((round(target(steering), 9), float(steering.player.state["goal"][0, 2])))
         assert len(goals) == 1
-        steering.let_go()
+        steering.release_all()
         steering.step()
         now = round(target(steering), 9), float(steering.player.state["goal"][0, 2])
         assert all(new != old for new, old in zip(now, *goals, strict=True))
@@ -200,7 +200,7 @@ def test_with_a_goal_of_the_users_an_episode_has_no_time_limit():
     steering.aim(0.0)
     began = [steering.step() or steering.player.began for _ in range(6)]
     assert not any(began)
-    steering.let_go()
+    steering.release_all()
     began = [steering.step() or steering.player.began for _ in range(3)]
     assert began == [False, False, True]  # the task has the episode's full length from here on
 

@@ -1,4 +1,4 @@
-"""The paper's figures, from run folders and policies. Matplotlib's global state is not changed."""
+"""Draws the paper's figures from run folders and policies, without changing matplotlib's global state."""
 
 from torchrl_mcp.analysis.curves import Curve, draw_curves, learning_curves, write_curves
 from torchrl_mcp.analysis.figures import save_figure

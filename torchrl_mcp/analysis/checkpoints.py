@@ -1,4 +1,4 @@
-"""Data of the paper's figures from checkpoints: walks, random exploration and trajectories by target direction."""
+"""Computes the data of the paper's figures from checkpoints: walks, random exploration, and trajectories."""
 
 import dataclasses
 import math
@@ -39,8 +39,11 @@ def walk_of(
         seconds: Duration of the walk in seconds.
         seed: Seed of the environments.
 
+    Returns:
+        The walk, and the mean :func:`~torchrl_mcp.analysis.walks.specialisation` of untrained networks.
+
     Raises:
-        ValueError: If the run is of another task, has no weights of primitives, or cannot walk.
+        ValueError: If the run has another task than imitation or no weights of primitives, or the policy cannot walk.
     """
     cfg = policies.policy_config(path)
     if cfg.task.name != "imitation":
@@ -49,9 +52,7 @@ def walk_of(
         )
     _, agent, _ = policies.restore(path, num_envs=1, seed=seed)
     if "gates" not in agent.actor.stored:
-        raise ValueError(
-            f"{path} has method={cfg.method.name}, which has no weights: pass a run of a method with a gate"
-        )
+        raise ValueError(f"{path} has method={cfg.method.name}, which has no gate: pass a run of a method with a gate")
     clips = single_motion(cfg.character.name, clip)
     cfg, agent, env = policies.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
     walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
@@ -64,7 +65,7 @@ def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk
 
     Args:
         cfg: Configuration of the run.
-        agent: The trained agent, for its normalisers.
+        agent: The trained agent, whose normalisers the untrained networks use.
         env: Environments of the run's task.
         walk: Walk of the trained agent.
     """
@@ -72,11 +73,12 @@ def untrained(cfg: DictConfig, agent: build.Agent, env: CharacterEnv, walk: Walk
     for seed in range(UNTRAINED):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            fresh = build.make_agent(cfg, env)
+            untrained_agent = build.make_agent(cfg, env)
         for name in ("observation_normaliser", "goal_normaliser"):
-            fresh.parts[name].load_state_dict(agent.parts[name].state_dict())
-        outputs = fresh.actor.policy(walk.inputs.clone())
-        gates, actions = (outputs[key].double().numpy() for key in ("gates", PRIMITIVES[0]))
+            untrained_agent.parts[name].load_state_dict(agent.parts[name].state_dict())
+        outputs = untrained_agent.actor.policy(walk.inputs.clone())
+        gates = outputs["gates"].double().numpy()
+        actions = outputs[PRIMITIVES[0]].double().numpy()
         numbers.append(specialisation(dataclasses.replace(walk, gates=gates, actions=actions)))
     return {key: statistics.mean(row[key] for row in numbers) for key in numbers[0]}
 
@@ -96,24 +98,24 @@ def explorer(cfg: DictConfig, agent: build.Agent, num: int, generator: torch.Gen
     if cfg.method.explorer is None:
         raise ValueError(
             f"method={cfg.method.name} has nothing to combine at random: pass checkpoints of methods that have a "
-            "method.explorer, such as mcp; the figure shows noise on actions, with which scratch begins, in any case"
+            "method.explorer, such as mcp. The figure always includes noise on actions, the exploration of scratch"
         )
     return build.instantiate(cfg.method.explorer)(agent.parts, num, generator)
 
 
 def explorer_title(cfg: DictConfig) -> str:
-    """Return a method's title and the name of the function that makes its explorer, ``MCP, random weights``."""
+    """Return a method's title and the name of the function that makes its explorer, as in ``MCP, random weights``."""
     function = cfg.method.explorer._target_.rpartition(".")[2]
     return f"{cfg.method.title}, {function.replace('_', ' ')}"
 
 
 def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[CharacterEnv, TensorDictBase]:
-    """Return environments for exploration and their common initial state, in the middle of a walk if possible.
+    """Return environments for exploration and their common initial state.
 
-    Episodes end with a fall or at the time limit.
+    Characters of this library begin in the middle of a walk. Episodes end with a fall or at the time limit.
 
     Args:
-        cfg: Configuration of any run with the character.
+        cfg: Configuration of a run with the character.
         num: Number of simulations.
         seconds: Duration of an episode in seconds.
         seed: Seed of the environments.
@@ -133,26 +135,30 @@ def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[Cha
 
 
 def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
-    """Return trajectories of a holdout policy: on held-out directions and, of pre-training, on seen directions.
+    """Return trajectories of a holdout policy on held-out directions, and for pre-training also on seen directions.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         seed: Seed of the environments.
 
     Returns:
-        Trajectories by a title with stage and directions, which marks runs that are still training.
+        Trajectories by title. The title names stage and directions, and marks runs that are still training.
     """
     cfg = policies.policy_config(path)
     panels = {}
-    over = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
+    finished = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):
         low, high = cfg.task.directions[shown]
         directions = torch.linspace(low, high, round((high - low) / SPACING) + 1, dtype=torch.float64)
         _, agent, env = policies.restore(path, num_envs=len(directions), seed=seed)
-        how = (
-            ("as pre-trained" if over else "in pre-training") if pretrained else f"{'after' if over else 'in'} transfer"
-        )
-        where = "on directions it saw" if shown == "pretrain" else "on held-out directions"
-        panels[f"{how},\n{where}"] = play_directions(agent.actor.policy, env, directions)
+        kind = "on directions it saw" if shown == "pretrain" else "on held-out directions"
+        panels[f"{_stage(pretrained, finished)},\n{kind}"] = play_directions(agent.actor.policy, env, directions)
     return panels
+
+
+def _stage(pretrained: bool, finished: bool) -> str:
+    """Return the beginning of a title, which tells the stage of a run and whether it is finished."""
+    if pretrained:
+        return "as pre-trained" if finished else "in pre-training"
+    return "after transfer" if finished else "in transfer"

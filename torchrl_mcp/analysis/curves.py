@@ -1,4 +1,4 @@
-"""Learning curves over several seeds, as in Figures 4 and 5 (left), from the metrics of run folders."""
+"""Draws learning curves over several seeds, as in Figures 4 and 5 (left), from the metrics of run folders."""
 
 import csv
 import math
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """A quantity against environment steps, over the seeds of one method.
+    """A quantity as a function of environment steps, over the seeds of one method.
 
     Attributes:
         label: Name of the method.
@@ -44,15 +44,15 @@ class Curve:
 def learning_curves(
     groups: Mapping[str, Sequence[Path]], *, quantity: str = NORMALISED_RETURN, num_bins: int = 50
 ) -> list[Curve]:
-    """Return one curve per group on a common grid of steps, up to the steps that every seed of the group has reached.
+    """Return one curve per group on a common grid of steps, up to the last step that all seeds of the group reached.
 
-    Steps are divided into ``num_bins`` equal bins up to the last value of the longest run. The value of a bin is the
-    mean of a run's rows, weighted by ``episode/count`` if the quantity is a mean over episodes. Bins without the end of
-    an episode are interpolated, and a run's last bin is left out if the run covers less than half of it. A bin should
-    be at least as long as an episode of all environments together: a shorter one can hold early failures only.
+    The steps up to the last value of the longest run are divided into ``num_bins`` equal bins. The value of a run in a
+    bin is the mean of its rows, weighted by ``episode/count`` if the quantity is a mean over episodes. Bins in which no
+    episode ends are interpolated. The last bin of a run is omitted if the run covers less than half of it. A bin should
+    have at least as many steps as one episode in all environments: shorter bins may contain only early failures.
 
     Args:
-        groups: Run folders, one per seed, by the label of their curve.
+        groups: Run folders, one per seed, by the labels of their curves.
         quantity: A column of ``metrics.csv``.
         num_bins: Number of bins.
 
@@ -61,14 +61,14 @@ def learning_curves(
     """
     runs = {label: [_points(Path(folder), quantity) for folder in folders] for label, folders in groups.items()}
     if empty := [label for label, points in runs.items() if not points]:
-        raise ValueError(f"groups {empty} name no run folder: leave them out or list their runs")
+        raise ValueError(f"groups {empty} have no run folders: omit these groups, or list their runs")
     longest = max(points[0].max() for group in runs.values() for points in group)
     edges = np.linspace(0.0, longest, num_bins + 1)
     return [_curve(label, [_binned(*points, edges) for points in group], edges) for label, group in runs.items()]
 
 
 def labelled_curves(groups: Sequence[tuple[str, Sequence[Path]]]) -> list[Curve]:
-    """Return :func:`learning_curves` of groups with their labels, which may be equal."""
+    """Return :func:`learning_curves` of groups with labels, some of which may be equal."""
     curves = learning_curves({str(number): folders for number, (_, folders) in enumerate(groups)})
     return [replace(curve, label=label) for curve, (label, _) in zip(curves, groups, strict=True)]
 
@@ -87,7 +87,7 @@ def draw_curves(
     curves: Sequence[Curve], *, xlabel: str = "environment steps", ylabel: str = "normalised return"
 ) -> Figure:
     """Draw curves as lines, each with the range of its seeds as a band around it, and a legend above."""
-    for columns in (2, 1):  # names may be too long for two
+    for columns in (2, 1):  # labels may be too long for two columns
         figure = new_figure(6.4, 3.2 + 0.2 * math.ceil(len(curves) / columns))
         plot_curves(figure.add_subplot(), curves, xlabel=xlabel, ylabel=ylabel)
         style = {"frameon": False, "fontsize": 9, "labelcolor": INK}
@@ -116,7 +116,7 @@ def plot_curves(
         xlabel: Label of the steps.
         ylabel: Label of the quantity.
     """
-    # When colours repeat, dashes distinguish lines.
+    # When the colours repeat, dashes distinguish the lines.
     lines = cycle(product(("-", "--", ":"), COLOURS))
     styles = styles or ({"color": colour, "linewidth": 2, "linestyle": line} for line, colour in lines)
     for curve, style in zip(curves, styles, strict=False):
@@ -138,26 +138,29 @@ def _legend(curve: Curve) -> str:
 
 
 def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
-    """Steps, values and weights of the rows with a finite quantity, each ``(R,)``."""
+    """Return steps, values and weights of the rows with a finite quantity, each ``(R,)``."""
     rows = read_metrics(run)
     if not rows or quantity not in rows[0]:
-        raise ValueError(f"{run} has no {quantity!r} in metrics.csv: the columns are {sorted(rows[0]) if rows else []}")
+        columns = sorted(rows[0]) if rows else []
+        raise ValueError(f"{run} has no column {quantity!r} in metrics.csv: use one of its columns, {columns}")
     weight = "episode/count" if quantity.startswith("episode/") else None
     points = [(row["frames"], row[quantity], row[weight] if weight else 1.0) for row in rows]
     points = [point for point in points if math.isfinite(point[1])]
     if not points:
-        raise ValueError(f"{run} has no finite {quantity!r} yet: let it run until episodes of full length have ended")
+        raise ValueError(f"{run} has no finite {quantity!r} yet: wait until episodes of full length have ended")
     frames, values, weights = np.array(points).T
     return frames, values, weights
 
 
 def _binned(frames: Array, values: Array, weights: Array, edges: Array) -> Array:
-    """Weighted means in the bins ``(edges[i], edges[i + 1]]``; NaN before the first point and after the last."""
-    index = np.searchsorted(edges, frames, side="left").clip(1, len(edges) - 1) - 1
-    total, mass = (np.bincount(index, x, minlength=len(edges) - 1) for x in (weights * values, weights))
-    bins = np.arange(len(edges) - 1)
+    """Return weighted means in the bins ``(edges[i], edges[i + 1]]``, which are NaN outside the run."""
+    num_bins = len(edges) - 1
+    index = np.searchsorted(edges, frames, side="left").clip(1, num_bins) - 1
+    total = np.bincount(index, weights * values, minlength=num_bins)
+    mass = np.bincount(index, weights, minlength=num_bins)
+    bins = np.arange(num_bins)
     full = mass > 0
-    last = index.max()  # dropped if the run covers less than half of it
+    last = index.max()  # omitted if the run covers less than half of this bin
     if full[:last].any() and frames.max() < (edges[last] + edges[last + 1]) / 2:
         full[last] = False
     return np.interp(bins, bins[full], total[full] / mass[full], left=np.nan, right=np.nan)
@@ -165,7 +168,7 @@ def _binned(frames: Array, values: Array, weights: Array, edges: Array) -> Array
 
 def _curve(label: str, seeds: Sequence[Array], edges: Array) -> Curve:
     stacked = np.stack(seeds)
-    known = np.isfinite(stacked).all(0)
-    middle = (edges[1:] + edges[:-1])[known] / 2
-    values = stacked[:, known]
+    complete = np.isfinite(stacked).all(0)
+    middle = (edges[1:] + edges[:-1])[complete] / 2
+    values = stacked[:, complete]
     return Curve(label, middle, values.mean(0), values.min(0), values.max(0), len(seeds))

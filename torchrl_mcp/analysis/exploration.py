@@ -1,4 +1,4 @@
-"""Paths of characters that explore at random: Figure 6."""
+"""Measures and draws the paths of characters that explore at random, as in Figure 6."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,10 +20,11 @@ from torchrl_mcp.methods.actor import Explorer
 
 Array = NDArray[np.float64]
 
-UPRIGHT, FALLEN = COLOURS[0], COLOURS[1]
+UPRIGHT = COLOURS[0]
+FALLEN = COLOURS[1]
 
 SPACING = 0.2
-"""Seconds between the rows of a path in a table."""
+"""Seconds between the positions of a path in a table."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Exploration:
     """Paths of characters from a common initial state.
 
     Attributes:
-        positions: Horizontal position of the root in metres from its start, ``(T + 1, N, 2)``; NaN after the end.
+        positions: Horizontal position of the root relative to its start in metres, ``(T + 1, N, 2)``; NaN after the
+            end of the episode.
         ended: Whether each character fell before the time limit, ``(N,)``.
         timestep: Seconds between two positions.
     """
@@ -44,12 +46,12 @@ class Exploration:
     def seconds(self) -> Array:
         """Seconds for which each character stayed upright, ``(N,)``."""
         steps = np.isfinite(self.positions[..., 0]).sum(0) - 1
-        # The position after an episode's last step is unknown.
+        # One more step, because the position after the last step of an episode is not recorded.
         return (steps + 1) * self.timestep
 
 
 def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> Explorer:
-    """Return an explorer that plays Gaussian noise around action 0, the rest pose of characters under PD control.
+    """Return an explorer that plays Gaussian noise around action 0, which is the rest pose under PD control.
 
     Args:
         action_dim: Size of the action, ``A``.
@@ -62,11 +64,11 @@ def action_noise(action_dim: int, *, std: float, generator: torch.Generator) -> 
 def explore(
     explorer: Explorer, normaliser: Callable[[Tensor], Tensor], env: CharacterEnv, start: TensorDictBase
 ) -> Exploration:
-    """Play one episode in each environment.
+    """Play one episode in each environment, in which the explorer acts.
 
     Args:
-        explorer: The explorer that acts.
-        normaliser: From observed states to normalised states for the explorer.
+        explorer: From normalised states to actions.
+        normaliser: From observed states to normalised states.
         env: Environments whose episodes end with a fall or at the time limit.
         start: Common initial state.
     """
@@ -81,11 +83,12 @@ def explore(
 
 
 def path_statistics(exploration: Exploration) -> dict[str, float]:
-    """Summarise the extent of exploration.
+    """Return measures of the extent of exploration.
 
-    ``upright`` is the share of characters that did not fall, ``seconds`` the median time until the fall or the time
-    limit, ``distance`` the median of the greatest distance from the origin in metres, and ``spread`` the circular
-    variance of the final directions from the origin: 0 if all are the same, 1 if they are uniform.
+    ``trajectories`` is the number of characters, ``upright`` the share of characters that did not fall, ``seconds`` the
+    median time until the fall or the time limit, ``distance`` the median of the greatest distance from the origin in
+    metres, and ``spread`` the circular variance of the final directions from the origin: 0 if all directions are the
+    same, 1 if they are uniform.
     """
     distances = np.linalg.norm(exploration.positions, axis=-1)
     angles = np.arctan2(*_last(exploration.positions).T[::-1])
@@ -99,7 +102,7 @@ def path_statistics(exploration: Exploration) -> dict[str, float]:
 
 
 def path_rows(exploration: Exploration) -> list[dict[str, float]]:
-    """Return the position of every character, every :data:`SPACING` seconds until its end."""
+    """Return the position of every character, every :data:`SPACING` seconds until the end of its episode."""
     every = max(1, round(SPACING / exploration.timestep))
     return [
         {"trajectory": number, "seconds": round(step * exploration.timestep, 3), "x": round(x, 3), "y": round(y, 3)}
@@ -110,14 +113,15 @@ def path_rows(exploration: Exploration) -> list[dict[str, float]]:
 
 
 def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure:
-    """Draw paths from above, one panel per exploration on a common scale, with an enlargement of short paths.
+    """Draw paths from above, one panel per exploration, on a common scale; short paths are also shown enlarged.
 
     Args:
         panels: Explorations by name.
         title: Title of the figure.
     """
     points = np.concatenate([panel.positions.reshape(-1, 2) for panel in panels.values()])
-    low, high = np.nanmin(points, 0), np.nanmax(points, 0)
+    low = np.nanmin(points, 0)
+    high = np.nanmax(points, 0)
     half = 0.53 * max((high - low).max(), 1e-3)
     limits = np.stack([(low + high) / 2 - half, (low + high) / 2 + half], -1)
     figure = new_figure(3.2 * len(panels), 4.5)
@@ -167,6 +171,6 @@ def _enlarge(axes: Axes, panel: Exploration, limit: float) -> None:
 
 
 def _last(positions: Array) -> Array:
-    """The last known position of every path, ``(N, 2)``."""
+    """Return the last recorded position of every path, ``(N, 2)``."""
     last = np.isfinite(positions[..., 0]).sum(0) - 1
     return positions[last, np.arange(positions.shape[1])]

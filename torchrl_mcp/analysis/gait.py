@@ -1,4 +1,4 @@
-"""Strides and their phases, from foot contacts alone, without the reference motion."""
+"""Detects strides and their phases from foot contacts, without the reference motion."""
 
 from itertools import pairwise
 
@@ -13,31 +13,31 @@ from torchrl_mcp.envs.characters.falls import falling_geoms, lowest_points
 from torchrl_mcp.envs.characters.kinematics import body_names
 
 CLEARANCE = 0.003
-"""Height in metres below which a foot stands; the bounce after touch-down is lower."""
+"""A foot stands below this height in metres; the bounce after touch-down is lower."""
 
 STEADY = 7
-"""Odd number of control steps of a majority vote on whether a foot stands, which removes flicker."""
+"""Odd number of control steps whose majority decides whether a foot stands, which removes flicker."""
 
 
 class Feet:
     """Detects which feet stand on the ground.
 
     Args:
-        env: The characters. Only the shapes and poses of their feet are used.
+        env: The characters, of which only the shapes and poses of the feet are used.
     """
 
     def __init__(self, env: PDCharacterEnv) -> None:
         model = env.simulation.model
         feet = env.character.feet
         bodies = body_names(env.character.name)
-        others = tuple(body for body in bodies if body not in feet)
-        self._geoms, self._half_sizes, self._radii = falling_geoms(model, others, len(bodies))
+        ignored = tuple(body for body in bodies if body not in feet)
+        self._geoms, self._half_sizes, self._radii = falling_geoms(model, ignored, len(bodies))
         owners = torch.from_numpy(model.geom_bodyid[self._geoms.numpy()])
         self._shapes = [owners == model.body(foot).id for foot in feet]
         self._outputs = env.simulation.outputs
 
     def standing(self) -> Tensor:
-        """Whether the right and the left foot stand now, ``(N, 2)``, bool."""
+        """Return whether the right and the left foot stand on the ground, ``(N, 2)``, bool."""
         heights = self._outputs["geom_xpos"][:, self._geoms, 2]
         vertical = self._outputs["geom_xmat"][:, self._geoms, 6:]
         down = lowest_points(heights, vertical, self._half_sizes, self._radii) < CLEARANCE
@@ -45,9 +45,9 @@ class Feet:
 
 
 def stride_phases(standing: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the phase of the stride: 0 when the right foot touches down, and 1 when it does so again.
+    """Return the phase of the stride, from 0 at a touch-down of the right foot to 1 at its next touch-down.
 
-    A stride counts only if the left foot touches down exactly once in it.
+    A stride counts only if the left foot touches down exactly once during the stride.
 
     Args:
         standing: Whether the right and the left foot stand, one row per control step, ``(T, 2)``.

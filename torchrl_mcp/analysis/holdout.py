@@ -1,4 +1,4 @@
-"""Trajectories by target direction, as in Figure 5 (right)."""
+"""Records and draws trajectories by target direction, as in Figure 5 (right)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,8 +25,8 @@ class Trajectories:
     """Trajectories of episodes, with their target directions.
 
     Attributes:
-        directions: Target directions in radians, counted from +x towards +y, ``(N,)``.
-        positions: Horizontal position of the root, ``(T, N, 2)`` in metres; NaN from an episode's end on.
+        directions: Target directions in radians, from +x towards +y, ``(N,)``.
+        positions: Horizontal position of the root in metres, ``(T, N, 2)``; NaN from the end of an episode on.
     """
 
     directions: NDArray[np.float64]
@@ -36,19 +36,22 @@ class Trajectories:
 def play_directions(
     policy: TensorDictModuleBase, env: CharacterEnv, directions: Tensor, *, deterministic: bool = True
 ) -> Trajectories:
-    """Play one episode per direction, in place of the directions that the environment draws.
+    """Play one episode per direction; these directions replace the random directions of the environment.
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``.
         env: Environments whose ``goal`` is the (cos, sin) of a direction, batch size ``[N]``.
         directions: Target directions in radians, ``(N,)``.
-        deterministic: Play the deterministic action rather than a sample.
+        deterministic: Play the deterministic action instead of a sample.
 
     Raises:
-        ValueError: If there is not one direction per environment.
+        ValueError: If the number of directions differs from the number of environments.
     """
     if directions.shape != env.batch_size:
-        raise ValueError(f"directions has shape {tuple(directions.shape)}: pass one per environment, {env.batch_size}")
+        raise ValueError(
+            f"directions must have one value per environment, {tuple(env.batch_size)}, not shape "
+            f"{tuple(directions.shape)}"
+        )
     env.reset()
     start = env.get_state()
     start["goal"] = unit_vector(directions).to(start["goal"].dtype)
@@ -60,8 +63,8 @@ def play_directions(
 def draw_trajectories(panels: Mapping[str, Trajectories]) -> Figure:
     """Draw trajectories, one panel per title, on a common scale in metres.
 
-    A path has the colour of its target direction, which a mark of that colour on the outer ring shows: perfect paths
-    are rays towards their marks.
+    The colour of a path stands for its target direction, which a mark of the same colour on the outer ring shows. A
+    perfect path is a ray towards its mark.
     """
     rings = _rings(max(_greatest_distance(panel) for panel in panels.values()))
     figure = new_figure(3.3 * len(panels), 4.0)
@@ -86,7 +89,7 @@ def _rings(reach: float) -> Sequence[float]:
 
 
 def _draw_compass(axes: Axes, rings: Sequence[float]) -> None:
-    """Draw rings of equal distance, and label the quarters around the outermost."""
+    """Draw rings of equal distance, and label the quarters around the outermost ring."""
     angle = np.linspace(0.0, 2 * math.pi, 361)
     for radius in rings:
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), color=FAINT, linewidth=0.8, zorder=0)

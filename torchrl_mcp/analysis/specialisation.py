@@ -1,6 +1,6 @@
-r"""Measures of specialisation for Figure 7: dependence of weights on the walk cycle, and separation of actions.
+r"""Measures specialisation for Figure 7: how weights depend on the walk cycle, and how far actions are separated.
 
-Samples are rows; ``K`` counts primitives, ``A`` actions, ``M`` samples.
+Samples are rows. ``M`` is the number of samples, ``K`` of primitives, and ``A`` the size of an action.
 """
 
 import numpy as np
@@ -27,17 +27,17 @@ def bin_means(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> Array
 
 
 def explained_by_phase(values: Array, phases: Array, num_bins: int = PHASE_BINS) -> tuple[Array, float]:
-    r"""Return the share of variance that the phase explains, for a dependence of any shape.
+    r"""Return the share of variance that the phase explains, whatever the form of the dependence.
 
     .. math:: \eta^2_k = \frac{\mathrm{Var}\left[\mathrm{E}[w_k | \phi]\right]}{\mathrm{Var}[w_k]}
 
     Args:
         values: Weights w, shape ``(M, K)``.
         phases: Phases in [0, 1), shape ``(M,)``.
-        num_bins: Number of bins, within which the mean is taken as constant.
+        num_bins: Number of bins; the mean is taken as constant within a bin.
 
     Returns:
-        The share of each column, ``(K,)``, 0 for constant columns, and the share of all columns together.
+        The share of each column, ``(K,)``, which is 0 for constant columns, and the share of all columns together.
     """
     deviation = values - values.mean(0)
     predicted = bin_means(deviation, phases, num_bins)[(phases * num_bins).astype(int)]
@@ -68,8 +68,8 @@ def circular_correlation(values: Array, phases: Array) -> Array:
 def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
     """Return the correlation of each column with left minus right foot on the ground, ``(K,)``.
 
-    It is 1 for a weight that is high when only the left foot stands and low when only the right one does, and -1 for
-    the opposite.
+    The correlation is 1 for a weight that is high when only the left foot stands and low when only the right foot
+    stands, and -1 for the opposite.
 
     Args:
         values: Weights, shape ``(M, K)``.
@@ -83,7 +83,7 @@ def stance_correlation(values: Array, standing: NDArray[np.bool_]) -> Array:
 
 
 def principal_components(actions: Array, num: int = 2) -> tuple[Array, Array]:
-    """Return the principal components of actions, ``(M, num)``, and their shares of the variance.
+    """Return the principal components of actions, ``(M, num)``, and their shares of the variance, ``(num,)``.
 
     Components beyond the number of actions are 0.
 
@@ -115,8 +115,8 @@ def silhouettes(actions: Array) -> Array:
     .. math:: s = \frac{b - a}{\max(a, b)}
 
     with a the mean distance of an action from the other actions of its primitive, and b its mean distance from the
-    actions of the nearest other primitive. 1 is well separated, 0 on the border, negative among other actions. A single
-    primitive has 0.
+    actions of the nearest other primitive. The silhouette is 1 for well separated actions, 0 on the border, and
+    negative among the actions of another primitive. A single primitive has 0.
 
     Args:
         actions: Mean action of every primitive in the same states, shape ``(M, K, A)``, M at least 2.
@@ -140,5 +140,5 @@ def silhouettes(actions: Array) -> Array:
 
 
 def _ratio(numerator: Array, denominator: Array) -> Array:
-    """Return quotients, 0 where the denominator is 0."""
+    """Return quotients, which are 0 where the denominator is 0."""
     return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator > 0)

@@ -1,4 +1,4 @@
-"""Weights over the walk cycle and mean actions of primitives: Figure 7."""
+"""Draws weights over the walk cycle, and mean actions of primitives, as in Figure 7."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,8 +19,8 @@ def draw_walk_cycle(walk: Walk, untrained: Mapping[str, float], *, title: str) -
     """Draw weights over the walk cycle, and mean actions in the plane of their first two principal components.
 
     Args:
-        walk: The walk to draw.
-        untrained: :func:`specialisation` of untrained networks.
+        walk: The walk.
+        untrained: :func:`~torchrl_mcp.analysis.walks.specialisation` of untrained networks.
         title: Title of the figure.
     """
     rows = -(-walk.gates.shape[-1] // 2)
@@ -92,7 +92,7 @@ def _draw_feet(axes: Axes, cells: Sequence[Mapping[str, float]]) -> None:
 
 
 def _spans(rows: Sequence[Mapping[str, float]]) -> list[tuple[float, float]]:
-    """Start and width of the bins of some rows."""
+    """Return start and width of the bins of rows."""
     return [(row["phase"] - 0.5 / PHASE_BINS, 1 / PHASE_BINS) for row in rows]
 
 
@@ -102,7 +102,7 @@ def _draw_actions(figure: SubFigure, walk: Walk) -> None:
     for number, colour in enumerate(colours(scores.shape[1]), start=1):
         points = scores[:, number - 1]
         axes.scatter(points[:, 0], points[:, 1], s=6, color=colour, linewidths=0)
-        # At the outer edge of the cloud: the origin is the mean of all clouds.
+        # The label is at the outer edge of the cloud, because the origin is the mean of all clouds.
         outwards = points.mean(0) / np.linalg.norm(points.mean(0))
         axes.annotate(
             str(number),

@@ -1,4 +1,4 @@
-"""Gates and primitives over a walk, and their specialisation: the numbers of Figure 7."""
+"""Records gates and primitives during a walk, and computes their specialisation, the numbers of Figure 7."""
 
 from dataclasses import dataclass
 
@@ -26,10 +26,10 @@ from torchrl_mcp.methods.actor import PRIMITIVES
 Array = NDArray[np.float64]
 
 STATES = 100
-"""Number of states, evenly spread over the walk, whose actions are drawn and compared."""
+"""Number of states, spread evenly over the walk, whose actions are drawn and compared."""
 
 GOLDEN = 0.6180339887498949
-"""Fractional part of the golden ratio: any number of its multiples spreads evenly over a cycle."""
+"""Fractional part of the golden ratio, any number of whose multiples are spread evenly over a cycle."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Walk:
         actions: Mean actions of the primitives, ``(M, K, A)``.
         inputs: Inputs of the policy, ``observation`` and ``goal``, batch size ``(M,)``.
         strides: Number of strides.
-        seconds: Mean duration of a stride.
+        seconds: Mean duration of a stride in seconds.
     """
 
     phases: Array
@@ -56,15 +56,16 @@ class Walk:
 
 
 def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float = 10.0) -> Walk:
-    """Record the complete strides of characters that follow the first reference motion from moments spread over it.
+    """Record the complete strides of characters that follow the first reference motion.
 
-    Samples count until a character falls or loses its reference.
+    The characters begin at times that are spread evenly over the motion. Samples count until a character falls or loses
+    its reference.
 
     Args:
-        policy: From ``observation`` and ``goal`` to ``action``, ``gates`` and ``primitives``; it plays its
-            deterministic action.
-        env: Imitation without changes of the reference.
-        seconds: Duration of the walk.
+        policy: From ``observation`` and ``goal`` to ``action``, ``gates`` and ``primitives``; its deterministic actions
+            are played.
+        env: Imitation, in which the reference does not change.
+        seconds: Duration of the walk in seconds.
 
     Raises:
         ValueError: If there is no complete stride.
@@ -95,8 +96,8 @@ def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
     """Find the complete strides of walkers, and concatenate their samples.
 
     Args:
-        steps: ``observation``, ``goal``, ``gates``, ``primitives``, ``standing`` and ``running``, whether the sample
-            counts, of N walkers, batch size ``(N, T)``.
+        steps: Samples of N walkers, batch size ``(N, T)``, with ``observation``, ``goal``, ``gates``, ``primitives``,
+            ``standing`` (whether each foot stands) and ``running`` (whether the sample counts).
         timestep: Seconds per step.
 
     Raises:
@@ -109,7 +110,7 @@ def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
     if not strides:
         raise ValueError(
             "the walk has no complete stride, in which one foot touches down between two touch-downs of the other: "
-            "take a policy that can walk"
+            "use a policy that can walk"
         )
     kept = TensorDict.cat([walker[torch.from_numpy(inside)] for walker, inside in zip(walkers, whole, strict=True)], 0)
     return Walk(
@@ -126,10 +127,11 @@ def complete_strides(steps: TensorDictBase, timestep: float) -> Walk:
 def specialisation(walk: Walk) -> dict[str, float]:
     """Return measures of the specialisation of a policy's primitives.
 
-    ``phase`` is the share of the variance of all weights that the phase of the stride explains, ``swing`` the mean
-    difference between the greatest and the least weight of a primitive over the cycle, ``left`` and ``right`` the
-    strongest correlation with standing on that foot, ``between`` the share of the variance of mean actions that is
-    between primitives, and ``silhouette`` the mean of :func:`~torchrl_mcp.analysis.specialisation.silhouettes`.
+    ``phase`` is the share of the variance of all weights that the phase of the stride explains. ``swing`` is the mean
+    difference between the greatest and the least weight of a primitive over the cycle. ``left`` and ``right`` are the
+    strongest correlations with standing on the left and on the right foot. ``between`` is the share of the variance of
+    mean actions that lies between primitives. ``silhouette`` is the mean of
+    :func:`~torchrl_mcp.analysis.specialisation.silhouettes`.
     """
     stance = stance_correlation(walk.gates, walk.standing)
     return {
@@ -149,7 +151,7 @@ def swings(walk: Walk) -> Array:
 
 
 def primitive_rows(walk: Walk) -> list[dict[str, float]]:
-    """Return a row of numbers for every primitive, counted from 1."""
+    """Return a row of measures for every primitive, counted from 1."""
     columns = {
         "weight": walk.gates.mean(0),
         "swing": swings(walk),
@@ -165,15 +167,17 @@ def primitive_rows(walk: Walk) -> list[dict[str, float]]:
 
 
 def cycle_rows(walk: Walk) -> list[dict[str, float]]:
-    """Return, for every bin of the cycle, the shares of time for which feet stand, and the weights of the primitives.
+    """Return a row for every bin of the cycle and every primitive.
 
-    Nine tenths of the samples lie between ``low`` and ``high``.
+    A row contains the phase, the mean weight of the primitive, the bounds ``low`` and ``high`` of nine tenths of the
+    samples, and the shares of time for which each foot stands.
     """
     bins = (walk.phases * PHASE_BINS).astype(int)
     feet = bin_means(walk.standing.astype(float), walk.phases)
     rows = []
     for index in np.unique(bins):
-        gates, (right, left) = walk.gates[bins == index], feet[index]
+        gates = walk.gates[bins == index]
+        right, left = feet[index]
         spread = zip(gates.mean(0), *np.quantile(gates, [0.05, 0.95], axis=0), strict=True)
         rows += [
             {
@@ -201,9 +205,10 @@ def action_rows(walk: Walk) -> list[dict[str, float]]:
 
 
 def plane(walk: Walk) -> tuple[Array, Array]:
-    """Return the first two principal components of mean actions, ``(STATES, K, 2)``, and their shares, ``(2,)``.
+    """Return the first two principal components of mean actions, and their shares of the variance.
 
-    The shares are of the variance of the mean actions of all primitives.
+    Returns:
+        Components, ``(STATES, K, 2)``, and shares of the variance of the mean actions of all primitives, ``(2,)``.
     """
     actions = _few(walk.actions)
     scores, shares = principal_components(actions.reshape(-1, actions.shape[-1]))
@@ -211,5 +216,5 @@ def plane(walk: Walk) -> tuple[Array, Array]:
 
 
 def _few(samples: Array) -> Array:
-    """At most :data:`STATES` of the samples, evenly spread."""
+    """Return at most :data:`STATES` of the samples, spread evenly."""
     return samples[np.linspace(0, len(samples) - 1, min(STATES, len(samples))).round().astype(int)]

@@ -1,1 +1,1 @@
-"""Evaluation: returns of episodes, tracking of each reference motion, and diagnostics of gates and options."""
+"""Evaluates policies: returns of episodes, tracking of every reference motion, and diagnostics of gates and options."""

@@ -6,7 +6,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 WIDTH = 60
-"""Columns of most bars."""
+"""Width of a bar with its texts in characters, unless another width is given."""
 
 
 def bar(
@@ -19,16 +19,16 @@ def bar(
     width: int = WIDTH,
     **kwargs: Any,
 ) -> tqdm:
-    """Return a bar, which is hidden without a terminal.
+    """Return a progress bar, which is hidden if the output is not a terminal.
 
     Args:
-        total: Number of steps, None if unknown.
+        total: Number of steps, or None if unknown.
         label: Text before the bar.
-        file: The terminal, standard error by default.
-        leave: Keep the bar when it is full.
-        form: Text after the bar, in ``tqdm``'s ``bar_format``.
-        width: Columns of bar and texts.
-        **kwargs: Passed on to ``tqdm``.
+        file: Output stream, standard error by default.
+        leave: Whether the bar stays on the terminal when it is full.
+        form: Text after the bar, in the format of ``tqdm``'s ``bar_format``.
+        width: Width of the bar with its texts in characters.
+        **kwargs: Further arguments of ``tqdm``.
     """
     return tqdm(
         desc=label,

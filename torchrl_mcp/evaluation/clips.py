@@ -1,4 +1,4 @@
-"""Evaluation of a policy on each of its reference motions."""
+"""Evaluates a policy on each of its reference motions."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -33,12 +33,17 @@ class ClipResult:
 
 
 class FollowsClips(Protocol):
-    """Environments that follow reference motions, such as :class:`~torchrl_mcp.envs.Imitation`.
+    """The interface of environments that follow reference motions, such as :class:`~torchrl_mcp.envs.Imitation`.
 
     Attributes:
         library: Clips, with ``names``, ``durations`` in seconds, and ``loops``.
-        switch_probability: Probability of a change of the reference in a step.
-        clip_end: What follows the end of a clip.
+        switch_probability: Probability that the reference changes in a step.
+        clip_end: What happens at the end of a clip; ``truncate`` ends the episode.
+        num_envs: Number of environments, ``N``.
+        max_episode_steps: Longest episode in control steps.
+        control_timestep: Seconds per control step.
+        batch_size: Batch size ``[N]``.
+        device: Device of the environments.
     """
 
     library: Any
@@ -51,11 +56,11 @@ class FollowsClips(Protocol):
     device: torch.device
 
     def beginning(self, clips: Tensor, times: Tensor) -> dict[str, Tensor]:
-        """State at times in seconds of clips, ``(N,)`` each."""
+        """Return the states at times of clips; clips and times in seconds have shape ``(N,)``."""
         ...
 
     def get_state(self) -> TensorDict:
-        """State of the simulations."""
+        """Return the state of the simulations."""
         ...
 
     def reset(self) -> TensorDictBase:
@@ -66,24 +71,29 @@ class FollowsClips(Protocol):
 def follow_each(
     policy: TensorDictModuleBase, env: FollowsClips, *, deterministic: bool = True, device: torch.device | str = "cpu"
 ) -> list[ClipResult]:
-    """Follow every clip in the same number of episodes, which begin at times spread evenly over it.
+    """Follow every clip in the same number of episodes, whose beginnings are spread evenly over the clip.
 
-    If a clip is longer than an episode, the episodes begin early enough to end within it.
+    If a clip is longer than an episode, all episodes begin early enough to end within the clip.
 
     Args:
         policy: From ``observation`` and ``goal`` to ``action``.
-        env: Environments without changes of the reference; their number is a multiple of the number of clips.
-        deterministic: Play the deterministic action rather than a sample.
+        env: Environments whose reference does not change during an episode. Their number is a multiple of the number of
+            clips.
+        deterministic: Play the deterministic action instead of a sample.
         device: Device of the policy.
 
+    Returns:
+        One result per clip, in the order of the library.
+
     Raises:
-        ValueError: If the reference may change, or the clips do not divide the environments.
+        ValueError: If the reference may change during an episode, or the number of environments is not a multiple of
+            the number of clips.
     """
     library = env.library
     count = len(env.library)
     if env.switch_probability or env.clip_end != "truncate":
         raise ValueError(
-            "the reference changes within an episode: make the environment with switch_interval=inf and "
+            "the reference must not change during an episode: make the environments with switch_interval=inf and "
             "clip_end='truncate'"
         )
     if env.num_envs % count:

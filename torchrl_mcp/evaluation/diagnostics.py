@@ -1,4 +1,4 @@
-"""Gate and option diagnostics, for training and evaluation."""
+"""Computes diagnostics of gates and options for training and evaluation."""
 
 import torch
 from tensordict import TensorDictBase
@@ -8,9 +8,10 @@ from torchrl_mcp.methods.options import option_diagnostics
 from torchrl_mcp.modules import gate_diagnostics
 
 DIAGNOSED = ("gates", "option", "begins")
+"""Keys of samples that diagnostics may read."""
 
 COLLAPSED = 1.1
-"""Effective number of options at or below which they count as collapsed into one."""
+"""Options count as collapsed into one if their effective number is at most this."""
 
 
 def diagnosed(actor: Actor) -> list[str]:
@@ -26,15 +27,15 @@ def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
         samples: Samples of the actor, of any batch shape, with the keys ``actor.stored``.
 
     Returns:
-        Numbers of :func:`~torchrl_mcp.modules.gate_diagnostics` under ``gates/``, if there are gates, and of
-        :func:`~torchrl_mcp.methods.options.option_diagnostics` under ``options/``, if options are chosen.
+        Numbers of :func:`~torchrl_mcp.modules.gate_diagnostics` with the prefix ``gates/`` if the actor has gates, and
+        of :func:`~torchrl_mcp.methods.options.option_diagnostics` with the prefix ``options/`` if it chooses options.
     """
     groups = {}
     if "gates" in actor.stored:
         groups["gates"] = gate_diagnostics(samples["gates"])
     if actor.num_options and "begins" in actor.stored:
         groups["options"] = option_diagnostics(samples["option"], samples["begins"], actor.num_options)
-    named = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
-    if not named:
+    numbers = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+    if not numbers:
         return {}
-    return dict(zip(named, torch.stack(list(named.values())).tolist(), strict=True))  # one transfer from a GPU
+    return dict(zip(numbers, torch.stack(list(numbers.values())).tolist(), strict=True))  # one transfer from a GPU

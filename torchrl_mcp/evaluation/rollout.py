@@ -1,4 +1,4 @@
-"""Evaluation of a policy by one episode in each of many environments."""
+"""Evaluates a policy by one episode in each of many environments."""
 
 import math
 from collections.abc import Callable, Collection
@@ -21,16 +21,17 @@ class Evaluation:
     """The outcome of one episode per environment.
 
     Attributes:
-        returns: Undiscounted sum of the task's own rewards of each episode, ``(N,)``.
+        returns: Undiscounted sum of the task's rewards in each episode, without shaping, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
         terminated: Whether the episode ended before its time limit, ``(N,)``.
-        metrics: Other measurements of the task by name, ``(N,)``: for a flag such as ``success``, whether it was ever
-            raised in the episode; for a number such as ``tracking_error``, its mean over the steps.
-        durations: Control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
-        decisions: Recorded outputs of the policy, for all steps of all episodes, batch size ``(M,)``.
-        reach: Returns of standing still and of an ideal player in the same episodes, if the task computes them.
-        positions: Positions after every step but an episode's last, ``(T, N, D)``, from there on NaN; None if they were
-            not measured.
+        metrics: Other measurements of the task by name, ``(N,)``. For a flag such as ``success``, the value is whether
+            the flag was ever raised in the episode; for a number such as ``tracking_error``, the mean over the steps.
+        durations: Number of control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
+        decisions: Recorded outputs of the policy for all steps of all episodes, batch size ``(M,)``.
+        reach: Returns of standing still and of an ideal player in the same episodes, or None if the task does not
+            compute them.
+        positions: Positions after every step, ``(T, N, D)``, NaN from the last step of an episode on; None if positions
+            were not recorded.
     """
 
     returns: Tensor
@@ -57,16 +58,16 @@ def evaluate(
 ) -> Evaluation:
     """Play one episode in each environment of a batch, to its end.
 
-    Counting the first episodes to finish instead would favour short ones.
+    A number of episodes in the order of their ends would contain too many short episodes.
 
     Args:
         policy: From keys of the environments, such as ``observation`` and ``goal``, to ``action``.
         env: Environments with batch size ``[N]`` whose episodes all end; ``env.metric_names`` lists the ``metrics``.
-        deterministic: Play the deterministic action rather than a sample.
-        start: State to begin from, as returned by ``env.get_state()``, or None to draw it.
-        record: Keys of the policy's output to keep as ``decisions``.
-        positions: Returns the positions of the environments, ``(N, D)``, which are then kept.
-        max_steps: Steps after which the episodes are left unfinished.
+        deterministic: Play the deterministic action instead of a sample.
+        start: Initial state, as returned by ``env.get_state()``, or None for a random initial state.
+        record: Keys of the policy's output that are recorded as ``decisions``.
+        positions: Function that returns the positions of the environments, ``(N, D)``, which are then recorded.
+        max_steps: Number of steps after which unfinished episodes are stopped.
         device: Device of the policy.
     """
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
@@ -121,18 +122,19 @@ def _by_name(values: dict[str, Tensor], names: dict[str, list[str]]) -> dict[str
 
 
 def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Return means over episodes, and their uncertainty.
+    """Return means over episodes, and the uncertainty of the normalised return.
 
     Args:
         outcome: The episodes.
         normalised_return: The task's normalisation of returns.
 
     Returns:
-        Means over episodes (``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
-        fraction, ``metrics``, ``durations`` of flags in control steps; if the task has it, ``reach``: the returns
-        ``standing`` and ``ideal``, and the ``place``, 0 at the one and 1 at the other), the standard deviation over
-        episodes (0 of a single one), and a 95 % percentile bootstrap ``interval`` of the mean of the normalised return
-        (of no width for a single episode).
+        Means over episodes: ``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
+        fraction, ``metrics``, and ``durations`` of flags in control steps. ``normalised_return_std`` is the standard
+        deviation over episodes, and ``interval`` the 95 % percentile bootstrap interval of the mean of the normalised
+        return; both are 0 wide for a single episode. ``reach``, which some tasks have, contains the returns of
+        ``standing`` and of an ``ideal`` player, and ``place``, which is 0 at the former and 1 at the latter.
+        ``episodes`` is the number of episodes.
     """
     normalised = normalised_return(outcome.returns)
     estimate = mean(normalised.tolist())

@@ -1,4 +1,4 @@
-"""Means of episodes and seeds with bootstrap intervals, computed by SciPy."""
+"""Computes means over episodes and seeds, with bootstrap intervals by SciPy."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 CONFIDENCE = 0.95
+"""Level of all intervals."""
 
 BATCH = 10_000_000
-"""Number of values that are resampled at a time; it bounds the memory."""
+"""Number of values that are resampled at a time, which limits the memory."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +19,8 @@ class Estimate:
 
     Attributes:
         value: The number.
-        low: Lower end of its 95 % interval, NaN if there is nothing to resample.
-        high: Upper end of the interval.
+        low: Lower end of the 95 % interval, NaN if a single value cannot be resampled.
+        high: Upper end of the interval, likewise.
     """
 
     value: float
@@ -30,7 +31,7 @@ class Estimate:
 def mean(values: Sequence[float]) -> Estimate:
     """Return the mean with its percentile bootstrap interval.
 
-    The interval of three values is their range: one resample in 27 holds the smallest value three times.
+    The interval of three values is their range, because one resample in 27 consists only of the smallest value.
 
     Raises:
         ValueError: If there is no value.
@@ -39,17 +40,17 @@ def mean(values: Sequence[float]) -> Estimate:
 
 
 def deviation(values: Sequence[float]) -> float:
-    """Return the standard deviation of a sample, over ``n - 1``; NaN of a single value."""
+    """Return the standard deviation of a sample, with the divisor ``n - 1``; NaN for a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
 
 
 def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
     """Return the mean of the middle half of all values, with a bootstrap interval that resamples within each stratum.
 
-    Strata of unequal size weigh the same.
+    Strata have equal weights, even if their sizes differ.
 
     Args:
-        strata: Values by task, one per seed.
+        strata: Values by task, one value per seed.
 
     Raises:
         ValueError: If a stratum has no value.
@@ -69,15 +70,15 @@ def interquartile_mean(strata: Sequence[Sequence[float]]) -> Estimate:
 
 
 def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Estimate:
-    """Return how probable it is that a run of one method is ahead of a run of another, on average over tasks.
+    """Return the probability that a run of one method is better than a run of another, on average over tasks.
 
     Equal values count half. The bootstrap interval resamples within each task and method.
 
     Args:
-        pairs: By task, values of the first and of the second method, one per seed.
+        pairs: Values of the first and of the second method, one value per seed, for every task.
 
     Raises:
-        ValueError: If there is no task, or a task without a value.
+        ValueError: If there is no task, or a task has no value.
 
     Reference:
         Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", 2021,
@@ -93,18 +94,18 @@ def probability_of_improvement(pairs: Sequence[tuple[Sequence[float], Sequence[f
 
 
 def shared_means(numbers: Sequence[Mapping[str, float]], left_out: str | tuple[str, ...] = ()) -> dict[str, float]:
-    """Return, by name, the means of numbers that all runs have, except names that begin with ``left_out``."""
-    shared = [name for name in (numbers[0] if numbers else {}) if all(name in other for other in numbers)]
-    kept = [name for name in shared if not name.startswith(left_out)]
-    return {name: sum(other[name] for other in numbers) / len(numbers) for name in kept}
+    """Return the means, by name, of the numbers that all runs have, except names that begin with ``left_out``."""
+    shared = [name for name in (numbers[0] if numbers else {}) if all(name in run for run in numbers)]
+    names = [name for name in shared if not name.startswith(left_out)]
+    return {name: sum(run[name] for run in numbers) / len(numbers) for name in names}
 
 
 def _estimate(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray], size: int) -> Estimate:
-    """Return a statistic with its interval; ``size`` is the number of values that it makes of each resample."""
+    """Return a statistic with its interval; ``size`` is the number of values that it computes per resample."""
     from scipy.stats import bootstrap  # slow to import
 
     if not strata or not all(len(values) for values in strata):
-        raise ValueError(f"values={list(map(list, strata))} contain an empty list: leave out what was not evaluated")
+        raise ValueError(f"values={list(map(list, strata))} must have no empty list: omit what was not evaluated")
     value = float(statistic(*map(np.asarray, strata), axis=-1))
     if any(len(values) < 2 for values in strata):
         return Estimate(value)

@@ -1,1 +1,1 @@
-"""The report: the results of many runs beside the paper's."""
+"""Reports the results of many runs next to the results of the paper."""

@@ -1,4 +1,4 @@
-"""A cell of a table of results: runs that differ only in their seeds, and its numbers."""
+"""Cells of tables of results, which are runs that differ only in their seeds, with their statistics."""
 
 import math
 import re
@@ -21,18 +21,18 @@ DEFAULT = "default"
 """Value of an argument that a run's configuration does not set."""
 
 SEED = re.compile(r"/seed\d+(?=/|$)|-\d{1,3}(?=\.torchrl$)")
-"""The seed in the path of a run folder, or in the name of published networks; a checkpoint's steps have more digits."""
+"""The seed in the path of a run folder or in the name of published networks. Checkpoints' steps have more digits."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Runs that differ only in their seeds, according to their configurations.
+    """Runs whose configurations differ only in the seed.
 
     Attributes:
         place: Task and character.
         stage: ``pretrain`` or ``transfer``.
         method: Name of the method.
-        settings: Settings that differ from other cells of the same place, stage and method.
+        settings: Settings in which the runs differ from other cells of the same place, stage and method.
         choices: :func:`~torchrl_mcp.report.comparison.choices` of the runs.
         runs: The runs, ordered by seed.
     """
@@ -46,12 +46,12 @@ class Cell:
 
     @cached_property
     def complete(self) -> list[Run]:
-        """Runs that are trained and evaluated; means leave out the others."""
+        """Runs that are trained and evaluated; means are over these runs."""
         return [run for run in self.runs if run.state == "complete"]
 
     @cached_property
     def by_seed(self) -> dict[int, list[Run]]:
-        """Complete runs by seed: several if benchmarks that share a folder stored the same run."""
+        """Complete runs by seed. A seed has several runs if the same run was stored more than once."""
         return grouped(self.complete, lambda run: run.seed)
 
     @property
@@ -71,38 +71,41 @@ class Cell:
 
     @property
     def variations(self) -> dict[str, Any]:
-        """Choices that are not the method's standard ones, by the names of their settings.
+        """Choices that differ from the method's standard choices, by the names of their settings.
 
-        Unless the method says otherwise, a new gate is standard, and no use of the character's symmetry.
+        Unless the method defines another standard, the gate is new and the character's symmetry is not used.
         """
         standard = {"gate": None, "symmetry": None} | self.runs[0].standard
         if self.stage == "pretrain":
-            standard.pop("trained", None)  # a choice of transfer: pre-training trains all parts
+            standard.pop("trained", None)  # only transfer has this choice, because pre-training trains all parts
         return {name: self.choices[name] for name, value in standard.items() if self.choices[name] != value}
 
     @property
     def is_standard(self) -> bool:
-        """Whether the settings are the method's standard ones, so that the cell is no variant."""
+        """Whether all choices are the method's standard choices."""
         return not self.variations
 
     @property
     def is_shared(self) -> bool:
         """Whether several seeds begin with the networks of the same pre-training."""
-        begun = {run.settings.get("pretrained") for run in self.complete}
-        return len(self.by_seed) > 1 and len(begun) == 1 and begun != {None}
+        origins = {run.settings.get("pretrained") for run in self.complete}
+        return len(self.by_seed) > 1 and len(origins) == 1 and origins != {None}
 
     @property
     def reported(self) -> Reported | None:
-        """The paper's figure, if it has one."""
+        """The number that the paper reports, or None."""
         comparable = self.stage == "transfer" and self.is_standard
         return TABLE_2.get((*self.place, self.method)) if comparable else None
 
     def returns(self, mode: str = "deterministic") -> list[float]:
-        """Normalised returns by seed, each a mean over the episodes of its complete runs."""
+        """Normalised return of each seed, the mean over the episodes of its complete runs."""
         return [fmean(run.evaluation[mode]["normalised_return"] for run in runs) for runs in self.by_seed.values()]
 
     def mean(self, mode: str = "deterministic") -> Estimate | None:
-        """Mean over seeds with its interval; for a single seed, the interval is over its episodes."""
+        """Return the mean over seeds with its interval, or None without complete runs.
+
+        For a single seed, the interval is over its episodes.
+        """
         returns = self.returns(mode)
         if len(returns) == 1:
             intervals = (run.evaluation[mode]["interval"] for run in self.complete)
@@ -111,39 +114,39 @@ class Cell:
 
     @property
     def spread(self) -> str:
-        """Name of the mean's interval: a bootstrap of two or three seeds is their range."""
+        """Name of the mean's interval: ``range`` for two or three seeds, whose bootstrap interval is their range."""
         return "range " if len(self.by_seed) in (2, 3) else ""
 
     def deviation(self, mode: str = "deterministic") -> float:
-        """Standard deviation over seeds, NaN of fewer than two."""
+        """Standard deviation over seeds, NaN for fewer than two seeds."""
         return deviation(self.returns(mode))
 
     @property
     def gap(self) -> float | None:
-        """Our deterministic mean over seeds less the paper's."""
+        """Our deterministic mean over seeds minus the paper's mean."""
         ours = self.mean()
         return ours.value - self.reported.mean if ours and self.reported else None
 
     @property
     def seconds(self) -> float:
-        """Mean wall time of the complete runs, or of all runs if none is complete."""
+        """Mean wall time in seconds of the complete runs, or of all runs if none is complete."""
         runs = self.complete or self.runs
         return sum(run.seconds for run in runs) / len(runs)
 
     @property
     def speed(self) -> float:
-        """Environment steps per second of all runs together, NaN before the first."""
+        """Environment steps per second of all runs together, NaN before the first step."""
         seconds = sum(run.seconds for run in self.runs)
         return sum(run.frames for run in self.runs) / seconds if seconds else math.nan
 
     @property
     def commits(self) -> list[str]:
-        """Commits of the runs."""
+        """Commits of the runs, without repetitions."""
         return list(dict.fromkeys(run.commit for run in self.runs))
 
     @property
     def standing(self) -> str:
-        """Progress of the runs, for a cell without a complete one."""
+        """Progress of the runs, for a cell without complete runs."""
         if any(run.state == "unfinished" for run in self.runs):
             return f"{sum(run.progress for run in self.runs) / len(self.runs):.0%} trained"
         return self.runs[0].state
@@ -155,32 +158,31 @@ class Cell:
 
     @property
     def reach(self) -> dict[str, float]:
-        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes, if the task has them."""
+        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes; empty for some tasks."""
         return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
 
     @property
     def remarks(self) -> list[str]:
         """Remarks on the reliability of the numbers."""
-        standings = grouped((run for run in self.runs if run.state != "complete"), _standing)
-        others = [run for run in self.complete if _is_evaluated_otherwise(run)]
+        incomplete = grouped((run for run in self.runs if run.state != "complete"), _standing)
+        reevaluated = grouped((run for run in self.complete if _is_evaluated_otherwise(run)), _protocol)
         seeds = [run.seed for run in self.runs]
-        return [
-            *(f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in standings.items()),
-            *(["one seed: the interval is over its episodes"] if len(self.by_seed) == 1 else []),
-            *(["seeds share one pre-training: their spread lacks that of pre-trainings"] if self.is_shared else []),
-            *(f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1),
-            *(
-                f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, which training would not do"
-                for protocol, runs in grouped(others, _protocol).items()
-            ),
-            *(f"mixed {difference}" for difference in mixed("evaluations", protocols(self.complete))),
-            *(f"mixed {difference}" for difference in mixed("pre-trainings", map(_pretraining, self.runs))),
-            *(f"trained with curriculum={self.choices['curriculum']}: {used}" for used in self.runs[0].curriculum),
-        ]
+        remarks = [f"{_seeds(run.seed for run in runs)} {standing}" for standing, runs in incomplete.items()]
+        if len(self.by_seed) == 1:
+            remarks.append("one seed: the interval is over its episodes")
+        if self.is_shared:
+            remarks.append("all seeds share one pre-training: the spread does not include that of pre-trainings")
+        remarks += [f"seed {seed} occurs more than once" for seed in sorted(set(seeds)) if seeds.count(seed) > 1]
+        for protocol, runs in reevaluated.items():
+            remarks.append(f"{_seeds(run.seed for run in runs)} evaluated in {protocol}, unlike after training")
+        remarks += [f"mixed {difference}" for difference in mixed("evaluations", protocols(self.complete))]
+        remarks += [f"mixed {difference}" for difference in mixed("pre-trainings", map(_pretraining, self.runs))]
+        curriculum = self.choices["curriculum"]
+        return remarks + [f"trained with curriculum={curriculum}: {used}" for used in self.runs[0].curriculum]
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
-    """Return items by the value of a function."""
+    """Return items in groups, by the value of a function."""
     groups: dict[Key, list[Item]] = defaultdict(list)
     for item in items:
         groups[key(item)].append(item)
@@ -188,48 +190,48 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names with more than one value; one that is missing counts, as the default, if it is an argument."""
+    """Return the names of settings with more than one value. An argument that is missing has the value ``default``."""
     names = dict.fromkeys(name for one in settings for name in one)
     shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
     return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
 
 
 def _target(name: str) -> str:
-    """Name of the setting with the class or function of which a setting is an argument."""
+    """Return the name of the setting with the class or function of which a setting is an argument."""
     return f"{name.rpartition('.')[0]}._target_"
 
 
 def protocols(runs: Sequence[Run]) -> list[str]:
-    """Return how each run was evaluated: its episodes, and settings of the environment that differ between runs."""
+    """Return a description of each run's evaluation: its episodes, and settings that differ between the runs."""
     environments = [run.evaluation.get("environment") or {} for run in runs]
-    telling = varying(environments)
+    names = varying(environments)
     return [
         f"{run.evaluation.get('episodes', 'unknown')} episodes of seed {run.evaluation.get('seed', 'unknown')}"
-        + "".join(f" with {name}={environment[name]}" for name in telling)
+        + "".join(f" with {name}={environment[name]}" for name in names)
         for run, environment in zip(runs, environments, strict=True)
     ]
 
 
 def mixed(name: str, values: Iterable[str]) -> list[str]:
-    """Return a line with the values, if they are more than one."""
+    """Return a line that lists the values if there are several, else no line."""
     distinct = sorted(set(values))
     return [f"{name}: {', '.join(distinct)}"] if len(distinct) > 1 else []
 
 
 def _protocol(run: Run) -> str:
-    """Return how a run was evaluated, with the settings of the task that its configuration has otherwise."""
+    """Return a description of a run's evaluation, with the settings of the task that differ from its configuration."""
     return "".join([*protocols([run]), *(f" with {name}={value}" for name, value in _changed(run).items())])
 
 
 def _changed(run: Run) -> dict[str, Any]:
-    """Return the settings of the task in a run's evaluation that its configuration has otherwise."""
+    """Return the settings of the task in a run's evaluation that differ from its configuration."""
     evaluated = leaves(run.evaluation.get("environment") or {}, "evaluation.environment.")
     changed = {name: value for name, value in evaluated if run.settings.get(name, value) != value}
     return {name.removeprefix("evaluation.environment."): value for name, value in changed.items()}
 
 
 def _is_evaluated_otherwise(run: Run) -> bool:
-    """Return whether a run's evaluation has other episodes, or another task, than its configuration says."""
+    """Return whether a run's evaluation has other episodes or another task than its configuration defines."""
     names = ("episodes", "seed")
     planned = [run.settings.get(f"evaluation.{name}") for name in names]
     played = [run.evaluation.get(name) for name in names]
@@ -237,7 +239,7 @@ def _is_evaluated_otherwise(run: Run) -> bool:
 
 
 def _pretraining(run: Run) -> str:
-    """Where the networks that a run began with come from, without their seed."""
+    """Return the origin of a run's initial networks, without the seed of their pre-training."""
     return SEED.sub("", str(run.settings.get("pretrained") or "none"))
 
 

@@ -1,4 +1,4 @@
-"""Groups of runs that are averaged, and what differs between them."""
+"""Groups runs whose results are averaged, and finds differences between the groups."""
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ class Ablation:
 
 
 def choices(run: Run) -> dict[str, Any]:
-    """Return settings that the paper or the command line names, and the method's own, which its file declares.
+    """Return the settings of a run that the report shows as choices; settings that a method lacks are None.
 
-    The method declares its own as ``method.standard``. Settings that a method lacks are None.
+    They are the choices that the paper compares, and the settings that a method declares as ``method.standard``.
     """
     settings = run.settings
     kept = settings.get("transfer.keep", ()) if run.stage == "transfer" else ()
     trained = "gate" if "primitives" in settings.get("transfer.freeze", ()) else "gate and primitives"
-    named = {
+    common = {
         "preset": run.preset,
         "total_frames": run.total_frames,
         **{name: settings[name] for name in run.standard if name in settings},
@@ -44,31 +44,32 @@ def choices(run: Run) -> dict[str, Any]:
         "pretrained": "builtin" if settings.get("pretrained") == "builtin" else None,
         "budget.pretrain": settings.get("budget.pretrain") if kept else None,
     }
-    return named | {name: settings.get(name) for name in run.standard if name not in named}
+    return common | {name: settings.get(name) for name in run.standard if name not in common}
 
 
 def cells(runs: Iterable[Run]) -> list[Cell]:
     """Group runs into cells, in the paper's order of tasks, stages and methods.
 
-    Runs of one task, character, stage, method and title share a cell unless their :func:`choices` differ, or any other
-    setting that :mod:`~torchrl_mcp.runs.identity` counts. Runs of different commits may share a cell.
+    Runs with the same task, character, stage, method and title share a cell unless they differ in their :func:`choices`
+    or in another setting that affects learning, as defined by :mod:`~torchrl_mcp.runs.identity`. Runs of different
+    commits may share a cell.
     """
     groups = []
     for alike in grouped(runs, lambda run: (run.place, run.stage, run.method, run.title)).values():
-        telling = varying([choices(run) for run in alike])
+        different = varying([choices(run) for run in alike])
         for chosen in grouped(alike, lambda run: _frozen(choices(run))).values():
-            groups += _cells(chosen, telling)
+            groups += _cells(chosen, different)
     return sorted(groups, key=_order)
 
 
 def reported(run: Run) -> Reported | None:
-    """Return the paper's figure for a run, if it has one."""
+    """Return the number that the paper reports for a run, or None."""
     (cell,) = cells([run])
     return cell.reported
 
 
 def methods(cells: Iterable[Cell]) -> dict[str, str]:
-    """Return the titles of methods by name: first in the order of Table 2, then alphabetically."""
+    """Return the titles of methods by name, in the order of Table 2; other methods follow in alphabetical order."""
     return {cell.method: cell.title for cell in sorted(cells, key=lambda cell: _rank(cell.method, METHODS))}
 
 
@@ -86,7 +87,7 @@ def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
 
 
 def caveats(cells: Sequence[Cell]) -> list[str]:
-    """Return differences between cells other than their methods, which may affect their results."""
+    """Return differences between cells, besides their methods, which may affect the results."""
     runs = [run for cell in cells for run in cell.runs]
     steps = {
         title: sorted({run.total_frames for run in group})
@@ -104,25 +105,26 @@ def caveats(cells: Sequence[Cell]) -> list[str]:
     ]
 
 
-def _cells(runs: Sequence[Run], telling: Sequence[str]) -> list[Cell]:
-    """Cells of runs with the same choices; ``telling`` are the names of choices that differ from other runs."""
-    others = _independent(varying([_learned(run) for run in runs]), runs)
+def _cells(runs: Sequence[Run], different: Sequence[str]) -> list[Cell]:
+    """Return the cells of runs with the same choices; ``different`` names choices that differ from other runs."""
+    further = _independent(varying([_learned(run) for run in runs]), runs)
     groups = []
-    for alike in grouped(runs, lambda run: _frozen(_learned(run), others)).values():
+    for alike in grouped(runs, lambda run: _frozen(_learned(run), further)).values():
         first = alike[0]
-        named = choices(alike[0])
-        learned = _learned(alike[0])
-        settings = {name: named[name] for name in telling if named[name] is not None}
-        settings |= {name: learned.get(name, DEFAULT) for name in others}
+        chosen = choices(first)
+        learned = _learned(first)
+        settings = {name: chosen[name] for name in different if chosen[name] is not None}
+        settings |= {name: learned.get(name, DEFAULT) for name in further}
         by_seed = sorted(alike, key=lambda run: run.seed)
-        groups.append(Cell(first.place, first.stage, first.method, settings, named, by_seed))
+        groups.append(Cell(first.place, first.stage, first.method, settings, chosen, by_seed))
     return groups
 
 
 def _independent(names: Sequence[str], runs: Sequence[Run]) -> list[str]:
-    """Return settings without those that only repeat another one, as references such as ``${mixer.temperature}`` do.
+    """Return settings without repetitions, which come from references such as ``${mixer.temperature}``.
 
-    Of settings with equal values in all runs, those of a command line stand for all, else the shortest path.
+    Settings are repetitions if their values are equal in every run. Of these, the settings that were given on a command
+    line are returned, or else the setting with the shortest path.
     """
     given = {name for run in runs for name in run.overrides}
     alike = grouped(names, lambda name: tuple(repr(run.settings.get(name, DEFAULT)) for run in runs)).values()
@@ -135,7 +137,7 @@ def _depth(name: str) -> tuple[int, int]:
 
 
 def _learned(run: Run) -> dict[str, Any]:
-    """Settings of a run that may affect learning."""
+    """Return the settings of a run that may affect learning."""
     other_stage = "task.transfer" if run.stage == "pretrain" else "task.pretrain"
     counted = PRETRAINING if run.stage == "transfer" and run.settings.get("transfer.keep") else set()
     ignored = UNLEARNT - counted | {other_stage} | (set() if _explores(run) else {"exploration"})
@@ -143,7 +145,7 @@ def _learned(run: Run) -> dict[str, Any]:
 
 
 def _explores(run: Run) -> bool:
-    """Return whether the policy of a run is one of the group ``exploration``, which other methods do not use."""
+    """Return whether a run uses the group ``exploration``, which some methods ignore."""
     return run.settings.get("actor._target_") == run.settings.get("exploration.actor._target_")
 
 
@@ -156,5 +158,5 @@ def _order(cell: Cell) -> tuple:
     return _rank(cell.place, PLACES), cell.stage, _rank(cell.method, METHODS), not cell.is_standard, variants
 
 
-def _rank(value: Any, known: Sequence[Any]) -> tuple[int, Any]:
-    return (known.index(value), "") if value in known else (len(known), value)
+def _rank(value: Any, order: Sequence[Any]) -> tuple[int, Any]:
+    return (order.index(value), "") if value in order else (len(order), value)

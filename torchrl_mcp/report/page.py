@@ -1,4 +1,4 @@
-"""The results of many runs beside the paper's, as a web page and as Markdown."""
+"""Writes the results of many runs next to the paper's results, as a web page and as Markdown."""
 
 import math
 from collections.abc import Sequence
@@ -30,9 +30,11 @@ from torchrl_mcp.training import precision
 from torchrl_mcp.training.run_folder import MODES
 
 PAGES = ("report.html", "report.md")
+"""Names of the templates and of the files of a report."""
 
 HARDWARE = ("processor", "cores", "device")
 LIBRARIES = ("python", "torch", "torchrl", "mujoco")
+"""Parts of a machine's description in a run's provenance."""
 
 
 def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime) -> dict[str, str]:
@@ -40,8 +42,8 @@ def report(runs: Sequence[Run], damaged: Sequence[Damaged], *, moment: datetime)
 
     Args:
         runs: Runs in any state.
-        damaged: Folders that could not be read.
-        moment: Time of reading.
+        damaged: Folders that cannot be read.
+        moment: Time at which the folders were read.
     """
     environment = Environment(
         loader=PackageLoader("torchrl_mcp.report"),
@@ -88,28 +90,28 @@ def _context(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, Any]:
 
 
 def states(runs: Sequence[Run], damaged: Sequence[Damaged]) -> dict[str, int]:
-    """Number of runs by state."""
+    """Return the number of runs by state."""
     states = [run.state for run in runs] + ["damaged"] * len(damaged)
     return {state: states.count(state) for state in STATES}
 
 
-def _picture(found: Sequence[Cell]) -> dict[str, Any]:
-    """Table 2 as bars, and a width in ``rem`` for its words; empty if no row has been run."""
-    if not (figure := draw_table_2(found)):
+def _picture(groups: Sequence[Cell]) -> dict[str, Any]:
+    """Return Table 2 as bars, with a width in ``rem`` that fits its text; empty if no row has been run."""
+    if not (figure := draw_table_2(groups)):
         return {}
-    svg = inline_svg(figure, "table-2", describe(found), PAGE_COLOURS)
+    svg = inline_svg(figure, "table-2", describe(groups), PAGE_COLOURS)
     return {"svg": svg, "width": round(6.4 * figure.get_figwidth())}
 
 
 def _overview(rows: Sequence[Row]) -> dict[str, Any]:
-    """Columns and rows of Table 2: the methods, and a section per task and character."""
+    """Return the columns and rows of Table 2: the methods, and a section per task and character."""
     places = dict.fromkeys(r.cell.place for r in rows)
     sections = {place: Section(place_title(place), [r for r in rows if r.cell.place == place]) for place in places}
     return {"methods": methods(r.cell for r in rows), "sections": sections}
 
 
 def _machine(run: Run) -> str:
-    """The machine, the precision of the networks and the libraries of a run in one line."""
+    """Return the machine, the precision of the networks and the libraries of a run in one line."""
     machine = run.provenance.get("machine") or {}
     parts = (
         f"{machine[name]} cores" if name == "cores" else f"{machine[name]}" for name in HARDWARE if name in machine
@@ -136,4 +138,4 @@ FILTERS = {
     "place": place_title,
     "cell": lambda text: str(text).replace("|", r"\|").replace("\n", " "),
 }
-"""Filters of the templates. ``cell`` is for Markdown's tables."""
+"""Filters of the templates. ``cell`` escapes text for Markdown's tables."""

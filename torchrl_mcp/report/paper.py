@@ -1,4 +1,4 @@
-"""The paper's results, for comparison in the report.
+"""Contains the paper's results, with which reports compare.
 
 Reference:
     Peng et al., "MCP: Learning Composable Hierarchical Control with Multiplicative Compositional Policies", NeurIPS
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Reported(NamedTuple):
-    """Mean and standard deviation of a normalised return over three seeds."""
+    """Mean and standard deviation of a normalised return over the paper's three seeds."""
 
     mean: float
     std: float
@@ -24,14 +24,15 @@ TITLES = {
     "latent_space": "Latent space",
     "mcp": "MCP",
 }
-"""Columns of Table 2."""
+"""Titles of the columns of Table 2, by the name of the method."""
 
 METHODS = tuple(TITLES)
 """Names of the methods in Table 2."""
 
 CHARACTERS = {"biped": "Biped", "humanoid": "Humanoid", "trex": "T-Rex", "ant": "Ant"}
+"""Titles of the paper's characters."""
 
-# Table 2: means and standard deviations, a column per method; None is a dash.
+# Table 2: means and standard deviations, one column per method; None stands for a dash.
 _ROWS: dict[tuple[str, str], tuple[list[float | None], list[float | None]]] = {
     ("heading", "biped"): (
         [0.927, 0.970, 0.834, 0.952, 0.918, 0.970, 0.976],

@@ -1,4 +1,4 @@
-"""The contents of run folders: configuration, progress, evaluation and provenance."""
+"""Reads run folders: configuration, progress, evaluation and provenance."""
 
 import csv
 import math
@@ -24,12 +24,13 @@ from torchrl_mcp.training.run_folder import (
 )
 
 STATES = ("complete", "not evaluated", "unfinished", "damaged")
+"""States of a run."""
 
-SAID = {"choices": str, "machine": str | int}
+VALUE_TYPES = {"choices": str, "machine": str | int}
 """Types of the values in the groups of a run's provenance."""
 
 MOST_FRAMES = 1e15
-"""Upper bound on environment steps, above any training."""
+"""Upper bound on environment steps, which no training reaches."""
 
 REQUIRED = {
     "task.name": str,
@@ -39,13 +40,13 @@ REQUIRED = {
     "seed": int,
     "training.total_frames": int,
 }
-
+"""Types of the settings that every configuration must have."""
 
 DEAD = "dead_units/"
-"""Beginning of the metrics with the share of dead units in the worst layer of a network."""
+"""Prefix of the metrics that give the share of dead units in the worst layer of a network."""
 
 MANY_DEAD = 1 / 3
-"""Share of dead units above which a run is remarked upon."""
+"""Share of dead units above which a report lists the network."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,12 @@ class Run:
         path: The folder.
         settings: The resolved configuration, flat: ``{"method.name": "mcp", "training.total_frames": 1500000, ...}``.
         frames: Environment steps taken so far.
-        seconds: Wall time of these steps.
-        has_episodes: Whether an episode has ended, so that there is a learning curve.
+        seconds: Wall time of these steps in seconds.
+        has_episodes: Whether an episode of full length has ended, so that the run has a learning curve.
         dead_units: Share of dead units in the worst layer of each network after these steps.
-        evaluation: Numbers of the final policy by mode, ``deterministic`` and ``stochastic``; empty before the end.
-        provenance: Commit, choices and machine at the start; empty for older runs.
-        fault: Error in the run's files, or None.
+        evaluation: Content of ``evaluation.json``, or empty if the run has not been evaluated.
+        provenance: Content of ``origin.json``, such as commit, choices and machine, or empty for older runs.
+        fault: Description of the damage in the run's files, or None.
     """
 
     path: Path
@@ -99,9 +100,8 @@ class Run:
 
     @property
     def standard(self) -> dict[str, Any]:
-        """Standard settings of the method."""
-        prefix = "method.standard."
-        return {name.removeprefix(prefix): x for name, x in self.settings.items() if name.startswith(prefix)}
+        """The method's standard settings."""
+        return self._below("method.standard.")
 
     @property
     def stage(self) -> str:
@@ -120,13 +120,13 @@ class Run:
 
     @property
     def preset(self) -> str:
-        """Preset of the settings: ``demo`` for runs of the demonstration, ``unknown`` if not recorded."""
+        """Preset of the run: ``demo`` for runs of the demonstration, ``unknown`` if not recorded."""
         is_demo = any(name.startswith("demo.") for name in self.settings)
         return self._choices.get("preset", "demo" if is_demo else "unknown")
 
     @property
     def commit(self) -> str:
-        """Commit of the library at the start, ``unknown`` if not recorded."""
+        """Commit of the library at the start of the run, ``unknown`` if not recorded."""
         return self.provenance.get("commit") or "unknown"
 
     @property
@@ -142,7 +142,7 @@ class Run:
 
     @property
     def curriculum_name(self) -> str | None:
-        """Choice of the group ``curriculum``, which older versions called ``practice``."""
+        """Choice of the group ``curriculum``, which older versions of the library called ``practice``."""
         return self.settings.get("curriculum.name", self.settings.get("practice.name"))
 
     @property
@@ -156,22 +156,24 @@ class Run:
         """Settings of the environment that differ between transfer and evaluation, as one line or none."""
         if self.stage != "transfer":
             return []
-        trained, evaluated = (
-            {name.removeprefix(prefix): value for name, value in self.settings.items() if name.startswith(prefix)}
-            for prefix in ("task.transfer.", "task.evaluation.")
-        )
+        trained = self._below("task.transfer.")
+        evaluated = self._below("task.evaluation.")
         shared = (name for name in trained if name in evaluated or name.startswith("curriculum."))
         different = [f"{name}={trained[name]}" for name in shared if trained[name] not in (None, evaluated.get(name))]
         return [", ".join(different)] if different else []
 
+    def _below(self, prefix: str) -> dict[str, Any]:
+        """Return the settings whose names begin with a prefix, by the rest of their names."""
+        return {name.removeprefix(prefix): value for name, value in self.settings.items() if name.startswith(prefix)}
+
     @property
     def progress(self) -> float:
-        """Share of the steps taken so far, at most 1."""
+        """Share of the planned steps that the run has taken, at most 1."""
         return min(1.0, self.frames / self.total_frames)
 
     @property
     def dying(self) -> dict[str, float]:
-        """The networks in which more than a third of a layer is dead after training."""
+        """Share of dead units by network, for networks with more than :data:`MANY_DEAD` after training."""
         if self.state == "unfinished":
             return {}
         return {network: share for network, share in self.dead_units.items() if share > MANY_DEAD}
@@ -187,7 +189,7 @@ class Run:
 
 
 def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
-    """Read the run folders in ``paths`` at any depth, each once, ordered by name.
+    """Read the run folders in ``paths`` at any depth, each only once, ordered by name.
 
     Raises:
         ValueError: If no path contains a run.
@@ -198,24 +200,26 @@ def find_runs(paths: Iterable[Path]) -> tuple[list[Run], list[Damaged]]:
             folders.setdefault(folder.resolve(), folder)
     if not folders:
         empty = " and ".join(f"{path} contains no run" for path in paths)
-        raise ValueError(f"{empty}: pass run folders, with {CONFIG} and {METRICS}, or folders of them")
+        raise ValueError(
+            f"{empty}: pass run folders, which contain {CONFIG} and {METRICS}, or folders that contain runs"
+        )
     outcomes = [read_run(folder) for folder in folders.values()]
     runs = [outcome for outcome in outcomes if isinstance(outcome, Run)]
     return runs, [outcome for outcome in outcomes if isinstance(outcome, Damaged)]
 
 
 def read_run(folder: Path) -> Run | Damaged:
-    """Read a run folder; errors in its files are returned, not raised."""
+    """Read a run folder. Errors in its files are part of the result; no exception is raised."""
     try:
         settings = dict(leaves(read_config(folder / CONFIG)))
     except FileNotFoundError:
         return Damaged(folder, f"has no {CONFIG}")
     except (OSError, ValueError) as error:
         return Damaged(folder, f"{CONFIG} cannot be read: {_line(error)}")
-    if unfit := [name for name, kind in REQUIRED.items() if not isinstance(settings.get(name), kind)]:
-        return Damaged(folder, f"{CONFIG} has no valid {', '.join(unfit)}")
+    if invalid := [name for name, kind in REQUIRED.items() if not isinstance(settings.get(name), kind)]:
+        return Damaged(folder, f"{CONFIG} has no valid {', '.join(invalid)}")
     if (total := settings["training.total_frames"]) < 1:
-        return Damaged(folder, f"{CONFIG} has training.total_frames={total}: it must be at least 1")
+        return Damaged(folder, f"{CONFIG} has training.total_frames={total}, which must be at least 1")
     contents: dict[str, Any] = {"settings": settings}
     faults = []
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
@@ -227,7 +231,7 @@ def read_run(folder: Path) -> Run | Damaged:
 
 
 def _run_folders(path: Path) -> Iterator[Path]:
-    """Yield the run folders in a folder, also those in other run folders and behind links, each once."""
+    """Yield the run folders below a folder, also inside other run folders and behind links, each only once."""
     visited = set()
     for folder, subfolders, names in os.walk(path, followlinks=True):
         if (real := os.path.realpath(folder)) in visited:
@@ -245,9 +249,9 @@ def _progress(folder: Path) -> dict[str, Any]:
     if not rows:
         return {}
     if not all(0 <= row["frames"] < MOST_FRAMES for row in rows):
-        raise ValueError(f"its frames are not numbers of steps below {MOST_FRAMES:.0e}")
+        raise ValueError(f"frames must be numbers of steps below {MOST_FRAMES:.0e}")
     if not math.isfinite(rows[-1]["seconds"]):
-        raise ValueError("its last row has no seconds")
+        raise ValueError("the last row has no seconds")
     return {
         "frames": int(rows[-1]["frames"]),
         "seconds": rows[-1]["seconds"],
@@ -262,18 +266,18 @@ def _evaluation(folder: Path) -> dict[str, Any]:
     content = read_json(folder / EVALUATION)
     for name, kind in {"episodes": int, "seed": int, "environment": dict}.items():
         if not isinstance(content.get(name), kind | None):
-            raise ValueError(f"its {name} is {content[name]!r}")
+            raise ValueError(f"{name} is {content[name]!r}")
     for mode in MODES:
         numbers = content[mode]
         for value in (numbers["normalised_return"], *numbers["interval"]):
             if not math.isfinite(value):
                 raise ValueError(f"the {mode} normalised return is {value}")
-        if wrong := [name for name, value in numbers.items() if not _is_evaluated(name, value)]:
-            raise ValueError(f"values of a wrong type in {mode}: {', '.join(wrong)}")
+        if wrong := [name for name, value in numbers.items() if not _is_quantity(name, value)]:
+            raise ValueError(f"{mode} has values of a wrong type: {', '.join(wrong)}")
     return {"evaluation": content}
 
 
-def _is_evaluated(name: str, value: Any) -> bool:
+def _is_quantity(name: str, value: Any) -> bool:
     """Return whether a quantity of an evaluation has a valid type."""
     if name == "interval":
         return isinstance(value, list) and len(value) == 2
@@ -289,15 +293,16 @@ def _provenance(folder: Path) -> dict[str, Any]:
     kinds = {"choices": dict, "machine": dict, "command": list, "commit": str, "precision": str}
     for name, kind in kinds.items():
         if not isinstance(content.get(name), kind | None):
-            raise ValueError(f"its {name} is {content[name]!r}")
+            raise ValueError(f"{name} is {content[name]!r}")
         if kind is list and not all(isinstance(value, str) for value in content.get(name) or []):
-            raise ValueError(f"its {name} is {content[name]!r}")
-        if kind is dict and not all(isinstance(value, SAID[name]) for value in (content.get(name) or {}).values()):
-            raise ValueError(f"its {name} are {content[name]!r}")
+            raise ValueError(f"{name} is {content[name]!r}")
+        values = (content.get(name) or {}).values() if kind is dict else []
+        if not all(isinstance(value, VALUE_TYPES[name]) for value in values):
+            raise ValueError(f"{name} is {content[name]!r}")
     return {"provenance": content}
 
 
 def _line(error: Exception) -> str:
-    """The first line of an error's message."""
+    """Return the first line of an error's message."""
     message = str(error).partition("\n")[0] or type(error).__name__
-    return f"it lacks {message}" if isinstance(error, KeyError) else message
+    return f"the file lacks {message}" if isinstance(error, KeyError) else message

@@ -1,4 +1,4 @@
-"""The parts of a report: cells in tables with their learning curves."""
+"""Composes the parts of a report: tables of cells with their learning curves."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,24 +15,31 @@ from torchrl_mcp.report.svg import inline_svg
 from torchrl_mcp.report.usage import diagnostics, usage, verdict
 
 LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS, start=1)}
+"""CSS colours of lines by the colours of figures."""
+
 PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
+"""CSS colours by all colours of figures."""
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}
-"""Line styles of matplotlib, and their equivalents in SVG."""
+"""Line styles of SVG by the equivalent styles of matplotlib."""
 
 ABLATIONS = {
     "num_primitives": (
         "Number of primitives",
-        "How many primitives the gate weighs. The paper varies it in Table 4.",
+        "The gate weighs this number of primitives, which the paper varies in Table 4.",
     ),
-    "trained": ("Gate alone, or gate and primitives", "What transfer trains. The paper compares both in Figure 8."),
+    "trained": (
+        "Gate alone, or gate and primitives",
+        "Transfer trains the gate alone, or also the primitives. The paper compares both in Figure 8.",
+    ),
     "mixer": ("Mixer", "Multiplicative composition of primitives (Eq. 3), or additive (Eq. 1)."),
     "exploration": ("Exploration", "Over actions (Eq. 4), or over the weights of primitives (Section 5.3)."),
     "curriculum": (
         "Curriculum",
-        "Episodes and rewards of training that differ from the paper's. Evaluations have the paper's.",
+        "Episodes and rewards of training may differ from the paper's. Evaluations always use the paper's.",
     ),
 }
+"""Title and explanation of each ablation, by its setting."""
 
 SETTING_WORDS = {
     "preset": "preset {}",
@@ -48,6 +55,7 @@ SETTING_WORDS = {
     "symmetry": "symmetry: {}",
     "pretrained": "{} pre-training",
 }
+"""Words for the values of settings."""
 
 DIAGNOSTICS = {
     "gates": (
@@ -64,11 +72,12 @@ DIAGNOSTICS = {
         {"effective_options": "Effective options", "begin_rate": "Begin rate", "duration": "Duration, steps"},
     ),
 }
+"""Title of each table of diagnostics, and the titles of its columns."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A cell with its name in a table, and its differences from cells of the same name."""
+    """A cell with its name in a table, and with its differences from cells of the same name."""
 
     cell: Cell
     name: str
@@ -82,7 +91,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Line:
-    """An entry of a legend: label, and style of the line in CSS."""
+    """An entry of a legend: a label, and the style of the line in CSS."""
 
     label: str
     colour: str
@@ -100,7 +109,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Section:
-    """Cells to compare with each other; ``kind`` is the heading of their column."""
+    """Cells that are compared with each other; ``kind`` is the heading of their column."""
 
     title: str
     rows: Sequence[Row]
@@ -109,17 +118,17 @@ class Section:
 
     @property
     def caveats(self) -> list[str]:
-        """Other differences between the cells."""
+        """Differences between the cells besides their methods."""
         return caveats([row.cell for row in self.rows])
 
     @property
     def remarks(self) -> dict[str, list[str]]:
-        """Labels of the rows by remark."""
-        found: dict[str, list[str]] = {}
+        """Labels of the rows to which a remark applies, by remark."""
+        labels: dict[str, list[str]] = {}
         for row in self.rows:
             for remark in row.cell.remarks:
-                found.setdefault(remark, []).append(row.label)
-        return found
+                labels.setdefault(remark, []).append(row.label)
+        return labels
 
     @property
     def metrics(self) -> list[str]:
@@ -128,16 +137,16 @@ class Section:
 
     @property
     def has_reported(self) -> bool:
-        """Whether the paper has a number for one of the cells."""
+        """Whether the paper reports a number for one of the cells."""
         return any(row.cell.reported for row in self.rows)
 
     @property
     def has_reach(self) -> bool:
-        """Whether one of the cells has a place between standing still and an ideal player."""
+        """Whether one of the tasks computes the returns of standing still and of an ideal player."""
         return any(row.cell.reach for row in self.rows)
 
     def is_best(self, cell: Cell, mode: str) -> bool:
-        """Whether a cell has the highest of at least two means."""
+        """Return whether a cell has the highest mean, if at least two cells have a mean."""
         means = [fmean(returns) for row in self.rows if (returns := row.cell.returns(mode))]
         cell_returns = cell.returns(mode)
         return bool(cell_returns) and len(means) > 1 and fmean(cell_returns) == max(means)
@@ -159,29 +168,29 @@ def place_title(place: tuple[str, str]) -> str:
 
 
 def method_colours(cells: Sequence[Cell]) -> dict[str, str]:
-    """Return colours of methods by their names."""
-    named = methods(cells)
-    return dict(zip(named, colours(len(named)), strict=True))
+    """Return the colours of methods by the names of the methods."""
+    names = methods(cells)
+    return dict(zip(names, colours(len(names)), strict=True))
 
 
 def row(cell: Cell) -> Row:
-    """Return a cell under the title of its method, with its variations and without the method's standard settings."""
+    """Return a row with the title of the cell's method, and the settings that differ from the method's standard."""
     standard = cell.runs[0].standard
     settings = {name: value for name, value in {**cell.variations, **cell.settings}.items() if value is not None}
-    telling = {name: value for name, value in settings.items() if name not in standard or value != standard[name]}
-    words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in telling.items())
+    different = {name: value for name, value in settings.items() if name not in standard or value != standard[name]}
+    words = (SETTING_WORDS.get(name, f"{name}={{}}").format(value) for name, value in different.items())
     return Row(cell, cell.title, ", ".join(words))
 
 
 def task_sections(cells: Sequence[Cell], names: Iterator[str], palette: Mapping[str, str]) -> list[Section]:
     """Return a section per task and character, as in Figures 4 and 9.
 
-    The table has all cells; the plot leaves out the cells of ablations.
+    The table contains all cells; the plot omits the cells of ablations.
 
     Args:
         cells: Cells of one stage.
-        names: Names for plots.
-        palette: Colours of methods by their names.
+        names: Names of plots, unique on the page.
+        palette: Colours of methods by the names of the methods.
     """
     ablated = {id(cell) for setting in ABLATIONS for part in ablations(cells, setting) for cell in part.cells}
     sections = []
@@ -194,7 +203,7 @@ def task_sections(cells: Sequence[Cell], names: Iterator[str], palette: Mapping[
 
 
 def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapter]:
-    """Return the ablations for which there are cells to compare."""
+    """Return the ablations for which at least two cells can be compared."""
     chapters = []
     for setting, (title, explanation) in ABLATIONS.items():
         sections = []
@@ -211,7 +220,7 @@ def ablation_chapters(cells: Sequence[Cell], names: Iterator[str]) -> list[Chapt
 
 
 def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return the diagnostics of gates and options, with a row per cell that has them."""
+    """Return the tables of diagnostics of gates and options, with a row for every cell that has diagnostics."""
     tables = []
     for group, (title, columns) in DIAGNOSTICS.items():
         rows = [
@@ -219,7 +228,7 @@ def diagnostic_tables(cells: Sequence[Cell]) -> list[dict[str, Any]]:
                 "row": row(cell),
                 "numbers": numbers,
                 "usage": [(run.seed, usage(run, group)) for run in cell.complete],
-                "verdicts": [(run.seed, sentence) for run in cell.complete if (sentence := verdict(run, group))],
+                "verdicts": [(run.seed, problem) for run in cell.complete if (problem := verdict(run, group))],
             }
             for cell in cells
             if (numbers := diagnostics(cell, group))
@@ -247,15 +256,15 @@ def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], n
     figure = new_figure(4.8, 2.8)
     curves = labelled_curves([(label, paths) for paths, label, _ in drawn])
     plot_curves(figure.add_subplot(), curves, [{**style, "linewidth": 1.5} for *_, style in drawn])
-    described = f"{title}: normalised return against environment steps, of {'; '.join(curve.label for curve in curves)}"
-    svg = inline_svg(figure, name, described, PAGE_COLOURS)
+    labels = "; ".join(curve.label for curve in curves)
+    svg = inline_svg(figure, name, f"{title}: normalised return over environment steps of {labels}", PAGE_COLOURS)
     lines = [Line(label, LINES[style["color"]], DASHES[style["linestyle"]]) for _, label, style in drawn]
     return Plot(svg, lines, [label for paths, label, _ in groups if not paths])
 
 
 def _styles(rows: Sequence[Row], palette: Mapping[str, str]) -> Iterator[dict[str, str]]:
-    """Yield a colour per method, with another line style for each variant, and for methods of the same colour."""
-    kinds: dict[str, Iterator[str]] = {}
+    """Yield colour and line style of rows: a method has one colour, and rows of one colour differ in line style."""
+    line_styles: dict[str, Iterator[str]] = {}
     for r in rows:
         colour = palette[r.cell.method]
-        yield {"color": colour, "linestyle": next(kinds.setdefault(colour, cycle(DASHES)))}
+        yield {"color": colour, "linestyle": next(line_styles.setdefault(colour, cycle(DASHES)))}

@@ -1,4 +1,4 @@
-"""Figures as part of a web page, in the page's own colours and font."""
+"""Converts figures to parts of a web page, which use the colours and the font of the page."""
 
 import io
 import re
@@ -11,20 +11,21 @@ from matplotlib.figure import Figure
 SVG = "http://www.w3.org/2000/svg"
 XLINK = "http://www.w3.org/1999/xlink"
 
-LEFT_OUT = {f"{{{SVG}}}metadata", f"{{{SVG}}}style"}
-"""Elements that are the same in every figure, or affect the whole page."""
+OMITTED = {f"{{{SVG}}}metadata", f"{{{SVG}}}style"}
+"""Elements that are omitted, because they are the same in every figure or affect the whole page."""
 
 
 def inline_svg(figure: Figure, name: str, description: str, colours: Mapping[str, str]) -> str:
     """Return a figure as an ``<svg>`` element for HTML, as wide as its container.
 
-    Text stays text. Identifiers without references are removed; the others are unique on the page because of ``name``.
+    Text stays text. Identifiers that nothing refers to are removed. All other identifiers are unique on the page,
+    because they depend on ``name``.
 
     Args:
         figure: The figure.
         name: Name of the figure, unique on the page.
         description: Description for screen readers.
-        colours: CSS colours by colours of the figure: ``{"#0072B2": "var(--line-1)"}``.
+        colours: CSS colours by colours of the figure, such as ``{"#0072B2": "var(--line-1)"}``.
     """
     buffer = io.StringIO()
     with rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
@@ -38,7 +39,7 @@ def inline_svg(figure: Figure, name: str, description: str, colours: Mapping[str
         if element.get("id") not in referenced:
             element.attrib.pop("id", None)
         for child in list(element):
-            if child.tag in LEFT_OUT:
+            if child.tag in OMITTED:
                 element.remove(child)
     for size in ("width", "height"):
         del root.attrib[size]

@@ -1,4 +1,4 @@
-"""Table 2 as a picture: a panel for each row, with our returns beside the paper's."""
+"""Draws Table 2 as a picture, with a panel for each row, and with our returns next to the paper's."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
@@ -14,32 +14,33 @@ from torchrl_mcp.report.comparison import methods
 from torchrl_mcp.report.paper import CHARACTERS, PLACES, TABLE_2, TITLES
 
 BAR = 0.38
-"""Width of a bar; a method has two, one unit apart from the next method's."""
+"""Width of a bar. A method has two bars, and methods are one unit apart."""
 
 COLUMNS = 4
-"""Panels beside one another."""
+"""Number of panels side by side."""
 
 Place = tuple[str, str]
+"""Task and character."""
 
 
 def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
-    """Return the cell that stands for each method in a row of Table 2.
+    """Return the cell that represents each method in a row of Table 2.
 
-    Scratch stands with its longest runs, which may have the steps of both stages, every other method with its shortest.
-    Of several :func:`.choices` of a method, such as two kinds of exploration, the one with the highest deterministic
-    return stands for it; of cells with the same choices, that with the most seeds.
+    Scratch is represented by its longest runs, which may have the steps of both stages, and every other method by its
+    shortest runs. Of cells with the same :func:`.choices`, the cell with the most seeds is taken. Of several choices,
+    such as two kinds of exploration, the cell with the highest deterministic return represents the method.
 
     Args:
         cells: Cells of any task and stage.
         place: Task and character.
     """
-    here = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
+    candidates = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
     best = {}
-    for method, alike in grouped(here, lambda cell: cell.method).items():
+    for method, alike in grouped(candidates, lambda cell: cell.method).items():
         steps = (max if method == "scratch" else min)(cell.steps for cell in alike)
-        kinds = grouped((cell for cell in alike if cell.steps == steps), lambda cell: repr(cell.choices))
-        most = (max(kind, key=lambda cell: len(cell.by_seed)) for kind in kinds.values())
-        best[method] = max(most, key=average)
+        by_choices = grouped((cell for cell in alike if cell.steps == steps), lambda cell: repr(cell.choices))
+        most_seeds = (max(group, key=lambda cell: len(cell.by_seed)) for group in by_choices.values())
+        best[method] = max(most_seeds, key=average)
     return best
 
 
@@ -49,9 +50,9 @@ def average(cell: Cell) -> float:
 
 
 def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
-    """Draw our returns and the paper's as bars, a panel for each row of Table 2 that has been run.
+    """Draw our returns and the paper's as bars, with a panel for each row of Table 2 that has been run.
 
-    Dots are single seeds. Where a task has successes, their share stands beside our bar.
+    Dots are single seeds. In tasks that define success, our bar is labelled with the share of successful episodes.
 
     Args:
         cells: Cells of any task and stage.
@@ -63,12 +64,13 @@ def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
     if not rows:
         return None
     run = methods(cell for row in rows.values() for cell in row.values())
-    named = TITLES | {name: title for name, title in run.items() if name not in TITLES}
-    lines, columns = -(-len(rows) // COLUMNS), min(len(rows), COLUMNS)
-    figure = new_figure(1.2 + 2.2 * columns, 0.5 + (0.5 + 0.27 * len(named)) * lines)
+    titles = TITLES | {name: title for name, title in run.items() if name not in TITLES}
+    lines = -(-len(rows) // COLUMNS)
+    columns = min(len(rows), COLUMNS)
+    figure = new_figure(1.2 + 2.2 * columns, 0.5 + (0.5 + 0.27 * len(titles)) * lines)
     panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat
     for place, axes in zip(rows, panels, strict=False):
-        draw_row(axes, place, rows[place], named)
+        draw_row(axes, place, rows[place], titles)
     for axes in list(panels)[len(rows) :]:
         axes.remove()
     keys = [Patch(color=COLOURS[0], label="ours"), Patch(color=FAINT, label="paper")]
@@ -76,12 +78,19 @@ def draw_table_2(cells: Sequence[Cell]) -> Figure | None:
     return figure
 
 
-def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping[str, str]) -> None:
-    """Draw a panel: two bars for each method, the first of them on top."""
+def draw_row(axes: Axes, place: Place, by_method: Mapping[str, Cell], titles: Mapping[str, str]) -> None:
+    """Draw a panel with two bars for each method, from top to bottom.
+
+    Args:
+        axes: Axes to draw on.
+        place: Task and character.
+        by_method: Our cells by the names of their methods.
+        titles: Titles of all methods by name.
+    """
     task, character = place
-    for position, method in enumerate(named):
-        if method in found:
-            cell = found[method]
+    for position, method in enumerate(titles):
+        if method in by_method:
+            cell = by_method[method]
             axes.barh(position - BAR / 2, average(cell), BAR, color=COLOURS[0])
             axes.plot(cell.returns(), [position - BAR / 2] * len(cell.by_seed), ".", color=INK, markersize=3)
             if "success" in cell.metrics:
@@ -91,8 +100,8 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
         if (*place, method) in TABLE_2:
             axes.barh(position + BAR / 2, TABLE_2[*place, method].mean, BAR, color=FAINT)
     axes.set_title(f"{task}, {CHARACTERS.get(character, character)}", fontsize=9, color=INK)
-    axes.set_yticks(range(len(named)), named.values())
-    axes.set_ylim(len(named) - 0.5, -0.5)
+    axes.set_yticks(range(len(titles)), titles.values())
+    axes.set_ylim(len(titles) - 0.5, -0.5)
     axes.set_xticks([0.0, 0.5, 1.0])
     axes.grid(axis="x", color="#EEEEEE")
     axes.set_axisbelow(True)
@@ -102,17 +111,17 @@ def draw_row(axes: Axes, place: Place, found: Mapping[str, Cell], named: Mapping
 def over_rows(cells: Sequence[Cell]) -> tuple[list[Place], dict[str, Estimate]]:
     """Return the rows of Table 2 in which every method was run, and each method's interquartile mean over them."""
     rows = {place: row for place in PLACES if (row := compared(cells, place))}
-    named = methods(cell for row in rows.values() for cell in row.values())
-    shared = [place for place, row in rows.items() if row.keys() == named.keys()]
-    returns = {name: [rows[place][name].returns() for place in shared] for name in named if shared}
+    names = methods(cell for row in rows.values() for cell in row.values())
+    shared = [place for place, row in rows.items() if row.keys() == names.keys()]
+    returns = {name: [rows[place][name].returns() for place in shared] for name in names if shared}
     return shared, {name: interquartile_mean(strata) for name, strata in returns.items()}
 
 
 def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
-    """Draw each method's interquartile mean, and how probable it is that a run of MCP is ahead of one of the method.
+    """Draw each method's interquartile mean, and the probability that a run of MCP is better than a run of the method.
 
-    Means are those of :func:`over_rows`, if there are any; the probability is over the rows that both have. Lines are
-    95 % bootstrap intervals, where every row has two seeds or more.
+    The means come from :func:`over_rows`; they are omitted if no row has all methods. The probability is computed over
+    the rows that both methods have. Lines are 95 % bootstrap intervals, drawn if every row has at least two seeds.
 
     Args:
         cells: Cells of any task and stage.
@@ -123,16 +132,16 @@ def draw_over_rows(cells: Sequence[Cell]) -> Figure | None:
     rows = [row for place in PLACES if "mcp" in (row := compared(cells, place)) and len(row) > 1]
     if not rows:
         return None
-    named = methods(cell for row in rows for cell in row.values())
-    others = [method for method in named if method != "mcp"]
+    run = methods(cell for row in rows for cell in row.values())
     shared, means = over_rows(cells)
     ahead = {
         name: probability_of_improvement([(f["mcp"].returns(), f[name].returns()) for f in rows if name in f])
-        for name in others
+        for name in run
+        if name != "mcp"
     }
-    figure = new_figure(7.5, 0.9 + 0.27 * len(named))
+    figure = new_figure(7.5, 0.9 + 0.27 * len(run))
     panels = figure.subplots(1, 2 if means else 1, squeeze=False)[0]
-    titles = {name: TITLES.get(name, title) for name, title in named.items()}
+    titles = {name: TITLES.get(name, title) for name, title in run.items()}
     if means:
         draw_estimates(panels[0], means, titles, f"interquartile mean over {len(shared)} rows")
     draw_estimates(panels[-1], ahead, titles, "probability that MCP is ahead")
@@ -154,7 +163,7 @@ def draw_estimates(axes: Axes, estimates: Mapping[str, Estimate], titles: Mappin
 
 
 def describe(cells: Sequence[Cell]) -> str:
-    """Return what the picture shows, for readers who do not see it."""
+    """Return the numbers of the picture as text, for readers who cannot see it."""
     parts = []
     for place in PLACES:
         returns = [
@@ -162,4 +171,4 @@ def describe(cells: Sequence[Cell]) -> str:
         ]
         if returns:
             parts.append(f"{place[0]} with the {CHARACTERS[place[1]]}: {', '.join(returns)}")
-    return f"Normalised returns beside the paper's. {'; '.join(parts)}"
+    return f"Normalised returns next to the paper's. {'; '.join(parts)}"

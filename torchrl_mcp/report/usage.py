@@ -1,4 +1,4 @@
-"""Usage of gates and options in evaluations: whether the primitives share the work."""
+"""Judges the usage of gates and options in evaluations: whether the primitives share the work."""
 
 import math
 
@@ -8,28 +8,28 @@ from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.results import Run
 
 WIDE_OPEN = 0.95
-"""Mean weight above which the gates no longer select: the composite is then the product of all primitives."""
+"""Above this mean weight the gates no longer select, because the composite is the product of all primitives."""
 
 RESTLESS = 0.9
-"""Share of steps in which an option begins, above which options last hardly longer than actions."""
+"""If an option begins in more than this share of steps, options last hardly longer than actions."""
 
 PARTS = {"gates": "primitive", "options": "option"}
-"""Name of the parts that share the work, by group of diagnostics."""
+"""Names of the parts that share the work, by group of diagnostics."""
 
 
 def diagnostics(cell: Cell, group: str) -> dict[str, float]:
-    """Means over seeds of the diagnostics of ``gates`` or ``options``, except :func:`usage`; empty without any."""
+    """Return the means over seeds of the diagnostics of ``gates`` or ``options``, except :func:`usage`."""
     return shared_means([_diagnostics(run, group) for run in cell.complete], "usage_")
 
 
 def usage(run: Run, group: str) -> list[float]:
-    """Usage of each primitive: the mean weight for ``gates``, the share of steps for ``options``."""
+    """Return the usage of each primitive: its mean weight for ``gates``, its share of steps for ``options``."""
     values = _diagnostics(run, group)
     return [values[f"usage_{index}"] for index in range(sum(name.startswith("usage_") for name in values))]
 
 
 def verdict(run: Run, group: str) -> str | None:
-    """Return a problem of the ``gates`` or ``options`` of a run, or None."""
+    """Return the description of a problem with the ``gates`` or ``options`` of a run, or None."""
     values = _diagnostics(run, group)
     if min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf)) < COLLAPSED:
         return f"one {PARTS[group]} does almost all the work"

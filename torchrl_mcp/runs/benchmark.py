@@ -1,9 +1,9 @@
-"""Benchmarks: many runs of ``torchrl-mcp-train`` by Hydra's launchers, pre-training before transfer.
+"""Benchmarks: many runs of ``torchrl-mcp-train``, which Hydra's launchers start, pre-training before transfer.
 
-A benchmark file has rows and settings, which are expanded to runs. The configured launcher starts them in two batches:
-first pre-training and runs without it, then transfer (Hydra's own sweepers cannot make one run wait for another). The
-configuration in a run's folder identifies it. Re-running a benchmark skips finished runs, resumes the others, and
-refuses folders with other settings.
+The rows and settings of a benchmark file are expanded to runs. The configured launcher starts the runs in two batches,
+because Hydra's sweepers cannot make one run wait for another: first pre-training and runs that need none, then
+transfer. The configuration in its folder identifies a run. Re-running a benchmark skips finished runs, resumes the
+others, and refuses folders with other settings.
 """
 
 import sys
@@ -38,6 +38,7 @@ from torchrl_mcp.training.run_folder import CONFIG, LOG
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
 
 Settings = Mapping[str, str]
+"""Values of settings by name, as on the command line."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Job:
         folder: Run folder.
         overrides: Command-line overrides.
         config: Resolved configuration.
-        needs: Folder of the pre-training that must be complete first, if any.
+        needs: Folder of the pre-training that must be complete first, or None without pre-training.
     """
 
     folder: Path
@@ -57,18 +58,18 @@ class Job:
     needs: Path | None = None
 
     def after(self, pretraining: Path) -> "Job":
-        """Return the job with transfer from the pre-training in a folder."""
+        """Return this job with transfer from the pre-training in a folder."""
         config = {**self.config, "pretrained": str(pretraining)}
         places = [quoting.setting("pretrained", pretraining), quoting.setting("run_dir", self.folder)]
         return Job(self.folder, [*self.overrides, *places], config, pretraining)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run the incomplete runs of the benchmark on the command line, and list those that fail.
+    """Run the incomplete runs of the benchmark on the command line.
 
     Raises:
-        ValueError: If the arguments fit no row, or a folder holds a run of other settings.
-        SystemExit: If a run has failed.
+        ValueError: If the arguments fit no row, or a folder holds a run with other settings.
+        SystemExit: If runs are not complete afterwards; the message lists them with the reasons.
     """
     with initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         hydra = GlobalHydra.instance().hydra
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str]) -> None:
         context = HydraContext(config_loader=hydra.config_loader, callbacks=cast("Any", Callback()))
         jobs = plan(master, hydra.config_loader)
         launcher = Plugins.instance().instantiate_launcher(context, run, master)
-        with trusting({name for job in jobs for name in targets(job.config)}):  # their run folders name them again
+        with trusting({name for job in jobs for name in targets(job.config)}):  # the run folders repeat these names
             unfinished = complete(jobs, launcher, master)
     if unfinished:
         sys.exit("\n".join(unfinished))
@@ -86,13 +87,16 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def complete(jobs: Sequence[Job], launcher: Launcher, master: DictConfig) -> list[str]:
-    """Launch the incomplete jobs of the benchmark ``master.benchmark``; return a line for each that stays incomplete.
+    """Launch the incomplete jobs of the benchmark ``master.benchmark``.
+
+    Returns:
+        A line with the reason for every job that is still incomplete.
 
     Raises:
-        ValueError: If a folder holds a run of other settings.
+        ValueError: If a folder holds a run with other settings.
     """
     if conflicts := [line for job in jobs if (line := conflict(job))]:
-        raise ValueError("\n".join(["nothing was started, as there are runs with other settings:", *conflicts]))
+        raise ValueError("\n".join(["nothing was started, because folders hold runs with other settings:", *conflicts]))
     runs = {job.folder: job.config["training"]["total_frames"] for job in jobs}
     name = MANIFEST.format(master.hydra.runtime.choices.benchmark)
     write_manifest(runs, Path(master.hydra.sweep.dir) / name)
@@ -104,12 +108,12 @@ def complete(jobs: Sequence[Job], launcher: Launcher, master: DictConfig) -> lis
 def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     """Return all runs of the benchmark ``master.benchmark`` with the command line applied, pre-training first.
 
-    An argument that is also a key of rows, such as ``task=heading``, selects rows; any other sets a setting of all
-    runs, to one value or several. If the method keeps parts, the run transfers from a pre-training with the same
+    An argument that is also a key of rows, such as ``task=heading``, selects rows. Any other argument sets a setting of
+    all runs, to one value or to several. If the method keeps parts, the run transfers from a pre-training with the same
     settings, which several runs may share.
 
     Raises:
-        ValueError: If there are none, the rows are no lists of values, no row has a value, or two runs with different
+        ValueError: If the benchmark's rows are malformed, no row fits the arguments, or two runs with different
             settings would share a folder.
     """
     rows = rows_of(master)
@@ -129,7 +133,8 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
             job = job.after(pretraining[key].folder)
         transfer.append(job)
     if not transfer:
-        raise ValueError(f"no row of the benchmark fits {' '.join(given)}; its rows are\n" + "\n".join(map(str, rows)))
+        listed = "\n".join(map(str, rows))
+        raise ValueError(f"no row of the benchmark fits {' '.join(given)}: select some of its rows,\n{listed}")
     jobs = [*pretraining.values(), *transfer]
     require_own_folders(jobs)
     return jobs
@@ -139,7 +144,7 @@ def rows_of(master: DictConfig) -> list[dict[str, list[Any]]]:
     """Return the rows of the benchmark ``master.benchmark``.
 
     Raises:
-        ValueError: If its file has another form.
+        ValueError: If ``rows`` is not a list of mappings from settings to lists of values.
     """
     content = OmegaConf.to_container(master.benchmark)
     rows: Any = content.get("rows") if isinstance(content, dict) else None
@@ -153,7 +158,7 @@ def rows_of(master: DictConfig) -> list[dict[str, list[Any]]]:
 
 
 def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> Iterator[Settings]:
-    """Yield the combinations of every row that ``choices`` allow, with every combination of the other choices.
+    """Yield the combinations of every row that ``choices`` permit, with every combination of the other choices.
 
     >>> list(expand([{"task": ["heading", "carry"]}], {"task": ["carry"], "seed": ["0", "1"]}))
     [{'task': 'carry', 'seed': '0'}, {'task': 'carry', 'seed': '1'}]
@@ -161,21 +166,23 @@ def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Se
     for row in rows:
         fixed = {key: [str(value) for value in row[key]] for key in row}
         selected = {key: [value for value in fixed[key] if value in choices.get(key, fixed[key])] for key in row}
-        others = {key: choice for key, choice in choices.items() if key not in row}
-        for combination in product(*selected.values(), *others.values()):
-            yield dict(zip([*selected, *others], combination, strict=True))
+        further = {key: choice for key, choice in choices.items() if key not in row}
+        for combination in product(*selected.values(), *further.values()):
+            yield dict(zip([*selected, *further], combination, strict=True))
 
 
 def require_in_rows(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Sequence[str]]) -> None:
     """Check that every chosen value fits a row.
 
     Raises:
-        ValueError: If all rows have the key, and none the value.
+        ValueError: If all rows have the key of a choice, but none has its value.
     """
     for key in (key for key in choices if all(key in row for row in rows)):
-        known = dict.fromkeys(str(value) for row in rows for value in row[key])
-        if unknown := [value for value in choices[key] if value not in known]:
-            raise ValueError(f"no row of the benchmark has {key}={','.join(unknown)}: give some of {','.join(known)}")
+        available = dict.fromkeys(str(value) for row in rows for value in row[key])
+        if unknown := [value for value in choices[key] if value not in available]:
+            raise ValueError(
+                f"no row of the benchmark has {key}={','.join(unknown)}: give some of {','.join(available)}"
+            )
 
 
 def values(override: Override) -> list[str]:
@@ -191,7 +198,7 @@ def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None
     Args:
         settings: Settings of the run.
         task: Configuration of the run's task.
-        seed: Seed of the pre-training, None for the run's.
+        seed: Seed of the pre-training, or None for the seed of the run.
     """
     name = task["name"] if "pretrain" in task else "imitation"
     kept = {
@@ -217,51 +224,55 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
 
 @contextmanager
 def _current(cfg: DictConfig) -> Iterator[None]:
-    """Let ``${hydra:...}`` refer to a configuration while the block runs.
+    """Let ``${hydra:...}`` refer to a configuration during the block.
 
-    Hydra documents how to set it, but has no function to return to the former one: its own jobs assign ``cfg``, too.
+    Hydra documents how to set the configuration, but not how to restore the previous one; Hydra's jobs also assign
+    ``cfg``.
     """
-    former = HydraConfig.instance().cfg
+    previous = HydraConfig.instance().cfg
     HydraConfig.instance().set_config(cfg)
     try:
         yield
     finally:
-        HydraConfig.instance().cfg = former
+        HydraConfig.instance().cfg = previous
 
 
 def require_own_folders(jobs: Sequence[Job]) -> None:
     """Check that no two jobs share a folder.
 
     Raises:
-        ValueError: If two jobs do.
+        ValueError: If two jobs have the same folder.
     """
     owners: dict[Path, Job] = {}
     for job in jobs:
-        if (other := owners.setdefault(job.folder, job)) is not job:
-            changed = ", ".join(differences(other.config, job.config)) or "nothing"
+        owner = owners.setdefault(job.folder, job)
+        if owner is not job:
+            changed = ", ".join(differences(owner.config, job.config)) or "nothing"
             raise ValueError(
                 f"two runs, which differ in {changed}, would share the folder {job.folder}: run them one after the "
-                "other, each with a run_root of its own"
+                "other, each with a different run_root"
             )
 
 
 def conflict(job: Job) -> str | None:
-    """Return why a job cannot use its folder, or None."""
+    """Return the reason why a job cannot use its folder, or None if it can."""
     if not (job.folder / CONFIG).exists():
         return None
     if not (changed := records.changes(job.folder, job.config)):
         return None
-    return f"{job.folder} differs in {', '.join(changed)}: keep it, and choose another run_root"
+    return f"{job.folder} differs in {', '.join(changed)}: keep the folder, and choose another run_root"
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
-    """Launch incomplete jobs, in batches as they become ready; return the launched jobs."""
+    """Launch incomplete jobs in batches, each as soon as its pre-training is complete, and return the launched jobs."""
     launched: list[Job] = []
     waiting = [job for job in jobs if not is_complete(job.folder)]
     while ready := [job for job in waiting if job.needs is None or is_complete(job.needs)]:
         try:
             launcher.launch([job.overrides for job in ready], initial_job_idx=len(launched))
-        except Exception:  # launchers raise anything when a worker dies; the folders show the finished runs
+        except (
+            Exception
+        ):  # launchers raise all kinds of errors when a worker dies; the folders show which runs finished
             traceback.print_exc()
         launched += ready
         waiting = [job for job in waiting if job not in ready]
@@ -269,7 +280,7 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
 
 
 def run(cfg: DictConfig) -> None:
-    """Train as configured, or resume; print to the log in the run folder."""
+    """Train as configured or resume the run, and write the output to the log in the run folder."""
     folder = Path(cfg.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
@@ -286,9 +297,9 @@ def is_complete(folder: Path) -> bool:
 
 
 def outcome(job: Job, launched: Sequence[Job]) -> str | None:
-    """Return why a job is not complete, or None if it is."""
+    """Return the reason why a job is not complete, or None if it is complete."""
     if is_complete(job.folder):
-        return conflict(job)  # with its pre-training, which may not have been there before
+        return conflict(job)  # its pre-training, which has been made meanwhile, may differ
     if job in launched:
         return f"failed: {job.folder}, see {job.folder / LOG}"
     return f"not run: {job.folder}, which needs {job.needs}"

@@ -1,4 +1,4 @@
-"""Builds environments, agent and trainer from a configuration, with Hydra's ``instantiate``."""
+"""Builds environments, agent and trainer from a configuration with Hydra's ``instantiate``."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ from torchrl_mcp.training.update import Agent, Objective, PPOSettings
 
 
 def make_run(cfg: DictConfig, folder: Path, initial: Path | None = None) -> Trainer:
-    """Return the trainer of a run, with all that it needs.
+    """Return the trainer of a run, after building its environments and its agent.
 
     Args:
         cfg: The configuration.
@@ -56,22 +56,29 @@ def make_run(cfg: DictConfig, folder: Path, initial: Path | None = None) -> Trai
 
 def make_source(cfg: DictConfig) -> TrajectorySource:
     """Return the configured source of trajectories."""
-    place: dict[str, Any] = {"pin_memory": torch.device(cfg.device).type == "cuda"}
+    placement: dict[str, Any] = {"pin_memory": torch.device(cfg.device).type == "cuda"}
     if cfg.physics.on_device:
-        place = {"device": cfg.device}
-    factory = partial(make_env, cfg, physics=instantiate(cfg.physics.engine), **place)
+        placement = {"device": cfg.device}
+    factory = partial(make_env, cfg, physics=instantiate(cfg.physics.engine), **placement)
     return instantiate(cfg.collector)(factory, num_envs=cfg.training.num_envs, seed=cfg.seed)
 
 
 def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Environments:
-    """Return the environments of the configured task and stage, with the transforms that the method needs, if any.
+    """Return the environments of the configured task and stage, with the transforms that the method may need.
+
+    Args:
+        cfg: The configuration.
+        num_envs: Number of environments.
+        seed: Seed of the environments.
+        **kwargs: Arguments of the environments that replace configured ones. A mapping replaces arguments of an object
+            that the task builds, such as its reference motions.
 
     Raises:
-        ValueError: As :func:`require_environment`.
+        ValueError: As :func:`require_environment`, or if the environments do not take an argument.
     """
     require_environment(cfg)
-    task, others = _with_parts(cfg.task[cfg.stage.name], kwargs)
-    arguments = applicable(task["_target_"], {"num_threads": cfg.num_threads, **others})
+    task, further = _with_parts(cfg.task[cfg.stage.name], kwargs)
+    arguments = applicable(task["_target_"], {"num_threads": cfg.num_threads, **further})
     require_arguments(task["_target_"], arguments)
     require_files(cfg, task)
     env = instantiate(task)(num_envs=num_envs, seed=seed, **arguments)
@@ -84,21 +91,20 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Env
 def make_agent(cfg: DictConfig, env: Environments, pretrained: Path | None = None) -> Agent:
     """Return the agent of the configured method.
 
-    If the checkpoint file ``pretrained`` is given, the parts that transfer keeps are loaded from it; in pre-training,
-    all parts in the file are.
+    From the checkpoint file ``pretrained``, transfer loads the parts that it keeps, and pre-training loads all parts.
 
     Raises:
-        ValueError: If the parts that transfer keeps or freezes are unknown or do not go together, or the file does not
-            fit.
+        ValueError: If transfer keeps or freezes unknown parts, or parts that do not go together, or if the networks of
+            the file do not fit the configuration.
     """
-    seen = env.observation_spec
-    sizes = Sizes(seen["observation"].shape[-1], seen["goal"].shape[-1], env.action_spec.shape[-1])
+    spec = env.observation_spec
+    sizes = Sizes(spec["observation"].shape[-1], spec["goal"].shape[-1], env.action_spec.shape[-1])
     parts = instantiate(cfg.parts)(sizes)
     names: Sequence[str] = ()
     if cfg.stage.name == "transfer":
         require_parts(parts, cfg.transfer.keep, "transfer.keep")
         if pretrained is not None and cfg.transfer.keep:
-            with _origin_named(cfg, pretrained):
+            with _explained(cfg, pretrained):
                 _load_kept(cfg, parts, sizes, env, pretrained)
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
@@ -108,35 +114,39 @@ def make_agent(cfg: DictConfig, env: Environments, pretrained: Path | None = Non
     actor = instantiate(cfg.actor)(parts, frozen=names)
     critic = instantiate(cfg.critic)(parts, sizes)
     if cfg.stage.name == "pretrain" and pretrained is not None:
-        with _origin_named(cfg, pretrained):
+        with _explained(cfg, pretrained):
             checkpoint.load_agent(parts, pretrained)
     parts.to(cfg.device)
     return Agent(parts, actor, critic, frozen)
 
 
 @contextmanager
-def _origin_named(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
-    """Say, if networks do not fit, in what the run that they come from differs from this one."""
+def _explained(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
+    """If networks do not fit, raise an error that names the settings in which their run differs from this run."""
     try:
         yield
     except ValueError as error:
         saved = OmegaConf.create(dict(checkpoint.saved_config(pretrained)))
         numbers = [name for name, number in cfg.method.standard.items() if isinstance(number, int)]
-        names = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
-        saved_values, values = (
-            {name: OmegaConf.select(one, path) for name, path in names.items()} for one in (saved, cfg)
-        )
+        paths = {"method": "method.name", "character": "character.name", **{name: name for name in numbers}}
+        saved_values = {name: OmegaConf.select(saved, path) for name, path in paths.items()}
+        values = {name: OmegaConf.select(cfg, path) for name, path in paths.items()}
         if saved_values == values:
             raise
-        other = [name for name in names if saved_values[name] != values[name]]
-        saved_words, words = (" ".join(f"{name}={one[name]}" for name in other) for one in (saved_values, values))
+        changed = [name for name in paths if saved_values[name] != values[name]]
+        saved_words = " ".join(f"{name}={saved_values[name]}" for name in changed)
+        words = " ".join(f"{name}={values[name]}" for name in changed)
         raise ValueError(
-            f"{pretrained} has networks of {saved_words}, which do not fit {words}: change either"
+            f"{pretrained} has networks of {saved_words}, which do not fit {words}: change one of the two"
         ) from error
 
 
 def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environments, pretrained: Path) -> None:
-    """Load the parts that transfer keeps, which may have seen an entry of the goal alone."""
+    """Load the parts that transfer keeps, whose pre-training may have had only one entry of the goal.
+
+    Raises:
+        ValueError: If ``transfer.goal_entry`` is not an entry of the goal, or no kept part reads the goal.
+    """
     origin = partial(builtin, cfg.method.name, cfg.character.name)
     if (name := cfg.transfer.goal_entry) is None:
         load_kept(parts, cfg.transfer.keep, pretrained, origin)
@@ -144,13 +154,14 @@ def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environ
     entry = require_entry(env, name)
     narrow = instantiate(cfg.parts)(sizes._replace(goal=entry.stop - entry.start))
     load_kept(narrow, cfg.transfer.keep, pretrained, origin)
-    seeing = [part for part in narrow if _shapes(parts[part]) != _shapes(narrow[part])]
-    if not {*seeing} & {*cfg.transfer.keep}:
+    reading_goal = [part for part in narrow if _shapes(parts[part]) != _shapes(narrow[part])]
+    if not {*reading_goal} & {*cfg.transfer.keep}:
         raise ValueError(
-            f"transfer.goal_entry={name} needs kept networks that saw it: add {' or '.join(seeing)} to transfer.keep"
+            f"transfer.goal_entry={name} needs a kept network that reads this entry: add "
+            f"{' or '.join(reading_goal)} to transfer.keep"
         )
-    for kept in cfg.transfer.keep:
-        widen_goal(parts[kept], narrow[kept], entry)
+    for part in cfg.transfer.keep:
+        widen_goal(parts[part], narrow[part], entry)
 
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:
@@ -160,8 +171,8 @@ def _shapes(module: nn.Module) -> dict[str, torch.Size]:
 def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder: Path) -> Trainer:
     """Return the trainer of an agent; ``cfg.autocast`` is true or false, as chosen by :func:`.precision.choose`.
 
-    A method whose samples last for several steps, such as choices, sets ``batch_factor``: its batches are larger than
-    ``training.frames_per_batch`` by this factor.
+    A method whose samples last for several steps, such as choices among options, sets ``batch_factor``. This factor
+    multiplies ``training.frames_per_batch``.
     """
     assert isinstance(cfg.autocast, bool)
     numbers = dict(cfg.training)
@@ -178,7 +189,7 @@ def make_trainer(cfg: DictConfig, agent: Agent, source: TrajectorySource, folder
 
 
 def make_objective(cfg: DictConfig, agent: Agent, env: Environments) -> Objective:
-    """Return what the agent optimises, and its optimisers; of a frozen actor there is none."""
+    """Return the objective of an agent, without an optimiser for a frozen actor."""
     actor_loss = instantiate(cfg.objective.loss)(agent.actor.trained)
     actor_loss.set_keys(action=agent.actor.sampled, sample_log_prob=agent.actor.log_prob)
     advantages = instantiate(cfg.objective.advantages)(agent.critic)
@@ -201,8 +212,8 @@ def make_objective(cfg: DictConfig, agent: Agent, env: Environments) -> Objectiv
 
 
 def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
-    """Return the configured logger, if any, and the recorder of films, weights and learning curves, if one is."""
-    # MLflow 3 writes to files, which need no server and stay in the run folder, only if this is set.
+    """Return the loggers of a run: the configured logger, and the recorder if ``record_interval`` is set."""
+    # Only with this variable does MLflow 3 write to files, which need no server and stay in the run folder.
     os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
     loggers = [instantiate(cfg.logger, **_identity(cfg.logger, folder))] if cfg.logger else []
     for logger in loggers:
@@ -216,7 +227,7 @@ def make_loggers(cfg: DictConfig, trainer: Trainer, folder: Path) -> list[Any]:
 
 
 def _identity(logger: DictConfig, folder: Path) -> dict[str, Any]:
-    """Return the arguments of a logger by which a resumed run goes on with the same run at W&B."""
+    """Return the arguments of a logger with which a resumed run continues the same run at W&B."""
     if logger.get("logger_type") != "wandb" or "id" in (logger.get("wandb_kwargs") or {}):
         return {}
     file = folder / WANDB
@@ -226,7 +237,7 @@ def _identity(logger: DictConfig, folder: Path) -> dict[str, Any]:
 
 
 def _with_parts(task: DictConfig, arguments: Mapping[str, Any]) -> tuple[DictConfig, dict[str, Any]]:
-    """Return a task's configuration and its other arguments, after setting arguments of the objects that it builds."""
+    """Merge arguments of the objects that a task builds into its configuration; also return the other arguments."""
     parts = {
         name: value
         for name, value in arguments.items()

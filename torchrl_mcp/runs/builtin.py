@@ -1,25 +1,26 @@
-"""Networks that come with the library: primitives and gates for its generated motions, and gates for tasks."""
+"""Finds the networks that come with the library: primitives and gates of generated motions, and gates for tasks."""
 
 from pathlib import Path
 
 FOLDER = Path(__file__).parents[1] / "networks"
+"""Folder of the built-in networks."""
 
 PREFIX = "builtin:"
-"""Prefix of the names of built-in networks on a command line, before the character."""
+"""Prefix of the names of built-in networks on a command line; the name of the character follows."""
 
 
 def builtin(method: str, character: str, task: str | None = None) -> Path:
     """Return the checkpoint file of a built-in network: a method's pre-training, or its gate for a task.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If the library has no such network.
     """
     path = FOLDER / f"{'-'.join(filter(None, (method, character, task)))}.torchrl"
     if not path.is_file():
-        there = ", ".join(file.stem for file in sorted(FOLDER.glob("*.torchrl")) if task or not has_task(file))
+        available = ", ".join(file.stem for file in sorted(FOLDER.glob("*.torchrl")) if task or not has_task(file))
         raise ValueError(
             f"no network for method={method} and character={character}{f' and task={task}' if task else ''} comes with "
-            f"the library, only {there}: pre-train one with stage=pretrain and give its run folder instead"
+            f"the library, only {available}: pre-train a network with stage=pretrain and give its run folder instead"
         )
     return path
 
@@ -30,7 +31,7 @@ def has_task(path: Path) -> bool:
 
 
 def names() -> list[str]:
-    """Return the names of MCP's built-in networks on a command line."""
+    """Return the names of MCP's built-in networks, as on a command line."""
     return sorted(f"{PREFIX}{path.stem.removeprefix('mcp-')}" for path in FOLDER.glob("mcp-*.torchrl"))
 
 

@@ -1,4 +1,4 @@
-"""The configuration of a run: composed by Hydra, checked, and completed to the plan of a run."""
+"""Composes the configuration of a run with Hydra, checks it, and completes it to the plan of the run."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -20,10 +20,11 @@ class Plan:
     """A run before anything is built or written.
 
     Attributes:
-        cfg: The configuration, with the widths of loaded networks: of those that transfer keeps, else of all.
+        cfg: The configuration, completed by the widths of the networks that the run loads.
         folder: The run folder.
         initial: Checkpoint file of the initial networks, or None for untrained networks.
-        config: The configuration as the run folder will hold it, but for an ``autocast`` of ``auto``.
+        config: The configuration as it will be stored in the run folder, where the chosen precision replaces an
+            ``autocast`` of ``auto``.
     """
 
     cfg: DictConfig
@@ -34,8 +35,8 @@ class Plan:
 
 def compose_run(*overrides: str) -> DictConfig:
     """Return the configuration of ``torchrl-mcp-train`` with these arguments."""
-    begun = GlobalHydra.instance().is_initialized()  # true on the command line
-    with nullcontext() if begun else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+    initialized = GlobalHydra.instance().is_initialized()  # true on the command line
+    with nullcontext() if initialized else initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
         return compose("train", list(overrides))
 
 
@@ -43,13 +44,14 @@ def planned(cfg: DictConfig) -> Plan:
     """Return the plan of a run.
 
     Raises:
-        ValueError: As :func:`require_valid` and :func:`.validation.require_used`, or if there is no such pre-training.
+        ValueError: As :func:`require_valid` and :func:`.validation.require_used`, or if the pre-training does not
+            exist.
     """
     config = require_valid(cfg)
     validation.require_used(cfg)
-    where = {name: config[name] for name in ("run_dir", "run_root")}
+    folders = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
-    cfg = cast("DictConfig", OmegaConf.merge(cfg, where, _sizes(cfg, initial)))
+    cfg = cast("DictConfig", OmegaConf.merge(cfg, folders, _sizes(cfg, initial)))
     return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
 
 
@@ -57,7 +59,7 @@ def require_valid(cfg: DictConfig) -> dict[str, Any]:
     """Check the values of all settings, and return them with references resolved.
 
     Raises:
-        ValueError: As :func:`.validation.require_valid`, or if a setting refers to one that is missing.
+        ValueError: As :func:`.validation.require_valid`, or if a reference between settings cannot be resolved.
     """
     try:
         config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
@@ -68,10 +70,10 @@ def require_valid(cfg: DictConfig) -> dict[str, Any]:
 
 
 def initial_networks(cfg: DictConfig) -> Path | None:
-    """Return the checkpoint file from which a run takes networks, or None if it takes none.
+    """Return the checkpoint file from which a run loads its initial networks, or None for untrained networks.
 
     Raises:
-        ValueError: If there is no such pre-training.
+        ValueError: If the pre-training does not exist.
     """
     if cfg.pretrained is None or (cfg.stage.name == "transfer" and not cfg.transfer.keep):
         return None
@@ -83,10 +85,10 @@ def initial_networks(cfg: DictConfig) -> Path | None:
 
 
 def _sizes(cfg: DictConfig, initial: Path | None) -> dict[str, float]:
-    """Return the widths of the networks that a run takes from a checkpoint file, and how their noise is scaled."""
+    """Return the widths of the networks that a run loads from a checkpoint file, and the gain of their noise."""
     if initial is None:
         return {}
     saved = checkpoint.saved_config(initial)
-    width = saved.get("width", 1.0)  # older networks have the paper's
+    width = saved.get("width", 1.0)  # older networks have the widths of the paper
     kept = {"kept_width": saved.get("kept_width", width), "std_gain": saved.get("std_gain", 1.0)}
     return kept if cfg.stage.name == "transfer" else {**kept, "width": width}

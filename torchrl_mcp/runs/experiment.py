@@ -1,4 +1,4 @@
-"""Runs, from the top: plan, check, hold the folder, build, record, train, evaluate."""
+"""Runs from beginning to end: plan, check, lock the folder, build, record, train, evaluate."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,57 +24,61 @@ from torchrl_mcp.training.trainer import Trainer
 def train(cfg: DictConfig) -> Path:
     """Train from the start in the run folder ``cfg.run_dir``, evaluate the policy, and return the folder.
 
-    If ``cfg.autocast`` is ``auto``, the folder's configuration holds the precision chosen for this machine.
+    If ``cfg.autocast`` is ``auto``, the configuration in the folder has the precision chosen for this machine.
 
     Raises:
-        ValueError: If the folder holds a run already, another process uses it, there is no environment for the
-            configured task and character, or the configuration lacks the checkpoint to transfer from.
+        ValueError: If the folder already holds a run, another process uses the folder, no environment has the
+            configured task and character, or the configuration lacks the pre-training that transfer needs.
     """
     plan = planned(cfg)
     require_all(plan.cfg)
-    with lock.held(plan.folder), trusting(targets(plan.config)):
+    with lock.hold(plan.folder), trusting(targets(plan.config)):
         return _train(plan)
 
 
 def resume(
     folder: Path, *, device: str | None = None, total_frames: int | None = None, moves: Mapping[str, str] | None = None
 ) -> Path:
-    """Continue the run in ``folder`` from its newest checkpoint, with its own configuration.
+    """Continue the run in ``folder`` from its newest checkpoint, with the configuration in the folder.
 
-    A run that :func:`~torchrl_mcp.runs.records.is_complete` is not changed. On another machine a run keeps its
+    A run that :func:`~torchrl_mcp.runs.records.is_complete` stays as it is. On another machine, a run keeps its
     precision.
 
     Args:
         folder: The run folder.
-        device: Device to go on with, or None for the run's own.
-        total_frames: Environment steps of the whole run, at least those that it has taken, or None for the run's own.
+        device: Device with which the run continues, or None for the run's previous device.
+        total_frames: Environment steps of the whole run, at least as many as it has taken, or None for the planned
+            number.
         moves: New places of files and folders outside the run folder, by the names of their settings.
 
     Raises:
-        ValueError: If the folder holds no run, another process uses it, its checkpoint is damaged, ``total_frames``
-            is no number of steps or less than it has taken, or this machine lacks the device, the logger or a file. The
-            run is as before.
+        ValueError: If the folder holds no run, another process uses the folder, the checkpoint is damaged,
+            ``total_frames`` is not a number of steps or less than the run has taken, ``moves`` names a setting without
+            a file, or this machine lacks the device, the logger or a file. The run is unchanged in all these cases.
     """
     if is_complete(folder) and total_frames is None and not moves:
         return folder
-    known = places.outside(read_config(folder / CONFIG))
-    if unknown := sorted(set(moves or {}) - set(known)):
-        raise ValueError(f"{folder} has no files by {' and '.join(unknown)}, only by {list(known)}: leave them out")
-    with lock.held(folder):
+    files = places.outside(read_config(folder / CONFIG))
+    if unknown := sorted(set(moves or {}) - set(files)):
+        raise ValueError(
+            f"{' and '.join(unknown)} must be settings of {folder} that name a file or folder, which are {list(files)}"
+        )
+    with lock.hold(folder):
         return _resume(folder, device, total_frames, moves or {})
 
 
 def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
-    """Train as configured, or resume the run if it has begun; return the folder.
+    """Train as configured, or resume the run if it has begun, and return the folder.
 
     Args:
-        cfg: The configuration. A resumed run keeps its own, except for the device and the places of files.
-        wait: If another process uses the run folder, wait for it.
+        cfg: The configuration. A resumed run takes only the device and the places of files from it.
+        wait: Whether to wait while another process uses the run folder.
 
     Raises:
         ValueError: As :func:`train` and :func:`resume`, or if the folder holds a run with other settings.
     """
-    with lock.held(Path(cfg.run_dir), wait=wait):  # from the first on: torchrl-mcp-status sees that the run is alive
+    # Lock the folder first, so that torchrl-mcp-status shows the run as running from the beginning.
+    with lock.hold(Path(cfg.run_dir), wait=wait):
         plan = planned(cfg)
         require_all(plan.cfg)
         with trusting(targets(plan.config)):
@@ -88,9 +92,9 @@ def _train_or_resume(plan: Plan, device: str) -> Path:
     if changed := records.changes(folder, plan.config):
         raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
     if is_complete(folder):
-        print(f"{folder} is complete: there is nothing left to do", flush=True)
-    there = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
-    return _resume(folder, device, None, there)
+        print(f"{folder} is complete: nothing remains to be done", flush=True)
+    moves = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
+    return _resume(folder, device, None, moves)
 
 
 def _train(plan: Plan) -> Path:
@@ -106,7 +110,7 @@ def _train(plan: Plan) -> Path:
 
 
 def _rehearse(trainer: Trainer, cfg: DictConfig) -> None:
-    """Take a step of the evaluation in environments of its own, which would otherwise fail after the training.
+    """Take one step of the final evaluation before training, so that an error in it is noticed before the training.
 
     Raises:
         ValueError: As :func:`~torchrl_mcp.adapters.check.require_specs`.
@@ -122,7 +126,7 @@ def _rehearse(trainer: Trainer, cfg: DictConfig) -> None:
 
 
 def _resume(folder: Path, device: str | None, total_frames: int | None, moves: Mapping[str, str]) -> Path:
-    """Continue a run, whose record changes once its state is restored."""
+    """Continue a run, and change its record only after its state has been restored."""
     config = records.replanned(folder, total_frames, moves)
     cfg = records.located(config, folder)
     if is_complete(folder) and is_complete(folder, cfg):
@@ -147,10 +151,8 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
         trainer = build.make_run(cfg, folder)
         trainer.restore(path)
         if not trainer.source.resumes_episodes:
-            print(
-                "the run begins new episodes, because checkpoints do not hold the state of its environments", flush=True
-            )
-    else:  # the environments had not been reset yet, so the checkpoint has no state of them
+            print("the run begins new episodes, because checkpoints lack the state of its environments", flush=True)
+    else:  # the environments had not been reset yet, so the checkpoint lacks their state
         trainer = build.make_run(cfg, folder, initial_networks(cfg))
         trainer.folder.metrics.rewind(0)
     for damaged in saved[: saved.index(path)]:
@@ -164,7 +166,7 @@ def _finish(trainer: Trainer, cfg: DictConfig, folder: Path) -> Path:
     trainer.folder.metrics.loggers = build.make_loggers(cfg, trainer, folder)
     trainer.run()
     if not (folder / CONFIG).is_file():
-        raise FileNotFoundError(f"{folder} was removed during the run, so that its results are lost")
+        raise FileNotFoundError(f"{folder} was removed during the run, and its results with it")
     if cfg.evaluation.episodes:
         numbers = evaluation(folder, episodes=cfg.evaluation.episodes, seed=cfg.evaluation.seed)
         write_json(numbers, folder / EVALUATION)

@@ -1,4 +1,4 @@
-"""Deterministic policies for other programs: ONNX, and ``torch.export``."""
+"""Exports deterministic policies to other programs, by ONNX and ``torch.export``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +21,7 @@ INPUTS = ("observation", "goal")
 
 
 class DeterministicPolicy(nn.Module):
-    """A policy as a function of plain tensors to its deterministic action, with input normalisers.
+    """A policy, including its input normalisers, as a function of plain tensors that returns the deterministic action.
 
     Args:
         policy: From the keys ``observation`` and ``goal`` to ``action``.
@@ -32,10 +32,10 @@ class DeterministicPolicy(nn.Module):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        if others := [str(key) for key in policy.in_keys if key not in INPUTS]:
+        if stored := [str(key) for key in policy.in_keys if key not in INPUTS]:
             raise ValueError(
-                f"the policy also reads {', '.join(others)}, which an environment remembers between steps: only "
-                f"policies of {' and '.join(INPUTS)} can be exported"
+                f"the policy also reads {', '.join(stored)}, which an environment stores between steps: export a "
+                f"policy that reads only {' and '.join(INPUTS)}"
             )
         self.policy = policy
 
@@ -47,14 +47,15 @@ class DeterministicPolicy(nn.Module):
 
 
 def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor], dict[str, str]]:
-    """Return the policy of a run, observations and goals for it, ``(num, S)`` and ``(num, G)``, and its interface.
+    """Return the policy of a run, example observations ``(num, S)`` and goals ``(num, G)``, and the policy's interface.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         num: Number of states.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or the policy is of another kind.
+        ValueError: If there is no checkpoint, the checkpoint is damaged, or the policy reads other keys than
+            observation and goal.
     """
     _, agent, env = policies.restore(path, num_envs=num, seed=0)
     state = env.reset()
@@ -71,7 +72,7 @@ def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> Export
 
     Args:
         policy: The policy.
-        states: Observations and goals for tracing, at least two.
+        states: Observations and goals for tracing, at least two of each.
     """
     batch = Dim("batch")
     with torch.no_grad():
@@ -79,21 +80,22 @@ def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> Export
 
 
 def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> None:
-    """Write a policy for ``torch.export.load``, which needs torch alone."""
-    with replacing(path) as partial, partial.open("wb") as file:  # torch warns of names without its suffix
+    """Write a policy for ``torch.export.load``, which needs only torch."""
+    with replacing(path) as partial, partial.open("wb") as file:  # torch would warn of the suffix of a path
         torch.export.save(export(policy, states), file)
 
 
 def write_onnx(
     policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path, metadata: Mapping[str, str]
 ) -> float | None:
-    """Write a policy as ONNX, inputs ``observation`` and ``goal``, output ``action``; check it if onnxruntime is there.
+    """Write a policy as ONNX, and compare its actions with torch's if onnxruntime is installed.
 
-    The first dimension of each is called ``batch``.
+    The inputs are ``observation`` and ``goal``, the output is ``action``; the first dimension of each is called
+    ``batch``.
 
     Args:
         policy: The policy.
-        states: Observations and goals for tracing, at least two.
+        states: Observations and goals for tracing, at least two of each.
         path: The file to write.
         metadata: Metadata of the file, see :func:`~torchrl_mcp.runs.interface.interface`.
 
@@ -116,7 +118,7 @@ def write_onnx(
 
 
 def _name_batch(graph: Any) -> None:
-    """Call the first dimension of a graph's inputs ``batch``, wherever it occurs."""
+    """Rename the first dimension of a graph's inputs to ``batch`` in the whole graph."""
     traced = graph.input[0].type.tensor_type.shape.dim[0].dim_param
     for value in (*graph.input, *graph.output, *graph.value_info):
         for dim in value.type.tensor_type.shape.dim:
@@ -125,7 +127,7 @@ def _name_batch(graph: Any) -> None:
 
 
 def onnx_difference(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> float | None:
-    """Return the largest difference between the actions of torch and of onnxruntime, None without onnxruntime."""
+    """Return the largest difference between the actions of torch and of onnxruntime, or None without onnxruntime."""
     try:
         import onnxruntime
     except ImportError:

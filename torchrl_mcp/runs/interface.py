@@ -1,4 +1,4 @@
-"""What a program without this library needs to run an exported policy: names, units, time steps and the scene."""
+"""Describes a policy to programs without this library: names, units, time steps and the scene."""
 
 import json
 from collections.abc import Mapping
@@ -14,12 +14,12 @@ from torchrl_mcp.envs.pd_character import PDCharacterEnv
 def interface(env: CharacterEnv | Adapter) -> dict[str, str]:
     """Return the interface of a policy to its environment, as JSON texts by key.
 
-    ``observation`` and ``goal`` list their entries in order, with name, number of values and unit; ``action`` lists the
+    ``observation`` and ``goal`` list their entries in order, with name, number of values and unit. ``action`` lists the
     actuators, whose control is ``centre + scale * action``, clipped to MuJoCo's ``ctrlrange``. ``scene`` is the MJCF of
-    the environment, also as JSON.
+    the environment as a JSON string.
 
-    Environments of other libraries have neither scene nor names: an entry is a whole input, and an action is that of
-    the environment.
+    Environments of other libraries have neither a scene nor names of entries: each input is one entry, and the actions
+    are the actions of the environment.
 
     Args:
         env: The environment in which the policy was trained.
@@ -55,7 +55,7 @@ def _adapted(env: Adapter) -> dict[str, str]:
 
 
 def _entries(env: CharacterEnv, key: str, layout: Mapping[str, slice]) -> list[dict[str, Any]]:
-    """Name, size and unit of each entry of an input; an input without a layout is one entry, an empty one none."""
+    """Return name, size and unit of each entry of an input; without a layout, a non-empty input is one entry."""
     size = env.observation_spec[key].shape[-1]
     layout = layout if layout or not size else {key: slice(0, size)}
     return [
@@ -69,7 +69,7 @@ def _entries(env: CharacterEnv, key: str, layout: Mapping[str, slice]) -> list[d
 
 
 def _action(env: CharacterEnv) -> list[dict[str, Any]]:
-    """Name, unit, centre and scale of each actuator."""
+    """Return name, unit, centre and scale of each actuator."""
     model = env.simulation.model
     zero = torch.zeros(env.num_envs, model.nu, dtype=torch.float64, device=env.device)
     centre = env._controls(zero)

@@ -1,4 +1,4 @@
-"""The lock of a run folder, held by one process at a time and released when it ends, on POSIX and on Windows."""
+"""Locks a run folder for one process at a time, until the process ends, on POSIX and on Windows."""
 
 import contextlib
 import errno
@@ -14,22 +14,22 @@ from typing import IO
 from torchrl_mcp.training.run_folder import remove_leftovers
 
 LOCK = ".lock"
-"""The locked file. It contains the holder's name, and remains only if the holder was killed."""
+"""The locked file. It names the process that holds the lock, and remains only if this process is killed."""
 
 PAUSE = 0.05
-"""Seconds between attempts."""
+"""Seconds between attempts to take the lock."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a disk without space, which say what to do."""
+"""Errors of a disk without space, whose messages already name the remedy."""
 
 ATTEMPTS = 20
-"""Number of attempts before a lock counts as held: :func:`holder` also takes it, briefly."""
+"""Number of attempts to take the lock. One is not enough, because :func:`holder` also takes the lock briefly."""
 
 if sys.platform == "win32":
     import msvcrt
 
     PLACE = 2**30
-    """Offset of the locked byte: beyond the content, so that other processes can read the content."""
+    """Offset of the locked byte, beyond the content, so that other processes can read the content."""
 
     def _take(file: IO[str], *, shared: bool = False) -> bool:
         os.lseek(file.fileno(), PLACE, os.SEEK_SET)
@@ -44,7 +44,8 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-    def _take(file: IO[str], *, shared: bool = False) -> bool:  # over NFS, a file that is only read takes no other
+    def _take(file: IO[str], *, shared: bool = False) -> bool:
+        # Over NFS, a file that is opened for reading can only be locked in shared mode.
         try:
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -53,14 +54,14 @@ else:
 
 
 @contextmanager
-def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold the lock of a run folder while the block runs, first without what killed processes have left there.
+def hold(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold the lock of a run folder during the block, and remove unfinished files of killed processes first.
 
-    Missing folders are created, and removed if they stay empty.
+    Missing folders are created, and removed again if they stay empty.
 
     Args:
         folder: The run folder.
-        wait: Wait until the lock is free.
+        wait: Whether to wait until the lock is free.
 
     Raises:
         ValueError: If another process holds the lock and ``wait`` is false, or the folder cannot be written.
@@ -68,7 +69,7 @@ def held(folder: Path, *, wait: bool = False) -> Iterator[None]:
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     while True:
         with _opened(folder) as file:
-            if not _taken(file, folder, wait) or not _is_there(file, folder):
+            if not _taken(file, folder, wait) or not _is_current(file, folder):
                 continue
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}")
@@ -85,7 +86,7 @@ def _opened(folder: Path) -> IO[str]:
     """Open the file of the lock.
 
     Raises:
-        ValueError: If the folder cannot be made or written.
+        ValueError: If the folder cannot be created or written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +98,7 @@ def _opened(folder: Path) -> IO[str]:
 
 
 def holder(folder: Path) -> str | None:
-    """Return the holder of a run folder's lock, such as ``process 4711 on host``, or None."""
+    """Return the process that holds the lock of a run folder, such as ``process 4711 on host``, or None."""
     try:
         with (folder / LOCK).open() as file:
             return None if _take(file, shared=True) else file.read() or "another process"
@@ -106,7 +107,7 @@ def holder(folder: Path) -> str | None:
 
 
 def _taken(file: IO[str], folder: Path, wait: bool) -> bool:
-    """Try to take the lock; return whether this process holds it.
+    """Try to take the lock, and return whether this process has taken it.
 
     Raises:
         ValueError: If another process holds the lock and ``wait`` is false.
@@ -118,14 +119,14 @@ def _taken(file: IO[str], folder: Path, wait: bool) -> bool:
     if wait:
         return False
     file.seek(0)
-    who = file.read() or "another process"
+    process = file.read() or "another process"
     raise ValueError(
-        f"{folder} is in use by {who}: wait until this process ends, or stop it, before you continue the run"
+        f"{folder} is in use by {process}: wait until this process ends, or stop it, before you continue the run"
     )
 
 
-def _is_there(file: IO[str], folder: Path) -> bool:
-    """Return whether the folder still has this file: the previous holder may have removed it."""
+def _is_current(file: IO[str], folder: Path) -> bool:
+    """Return whether the folder still contains this file, which the previous holder may have removed."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK))
     except FileNotFoundError:
@@ -133,7 +134,7 @@ def _is_there(file: IO[str], folder: Path) -> bool:
 
 
 def _remove(folder: Path, made: Sequence[Path]) -> None:
-    """Remove the file and, innermost first, folders in ``made`` that are empty."""
+    """Remove the file of the lock, and the folders in ``made`` that are empty, innermost first."""
     with contextlib.suppress(OSError):  # Windows cannot remove open files
         (folder / LOCK).unlink()
     with contextlib.suppress(OSError):

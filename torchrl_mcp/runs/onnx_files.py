@@ -1,4 +1,4 @@
-"""ONNX files of exported programs."""
+"""Writes exported programs as ONNX files."""
 
 import logging
 import warnings
@@ -13,7 +13,7 @@ from torchrl_mcp.training.run_folder import replacing
 
 
 def require_onnx(path: Path) -> None:
-    """Check that ONNX can be written.
+    """Check that the packages which write ONNX are installed.
 
     Raises:
         ValueError: If onnx or onnxscript is not installed.
@@ -33,15 +33,15 @@ def write_program(
     Args:
         program: The program.
         path: The file to write.
-        inputs: Names of its arguments.
-        outputs: Names of its results.
-        edit: Called with the ONNX model before it is saved, to change it in place.
+        inputs: Names of the program's arguments.
+        outputs: Names of the program's results.
+        edit: Function that changes the ONNX model in place before it is saved.
     """
     import onnx
 
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of operators of packages that are not needed
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # otherwise warns of packages that are not needed
     with replacing(path) as partial, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's exporter warns about itself
+        warnings.simplefilter("ignore")  # torch's exporter calls deprecated functions of torch
         torch.onnx.export(
             program,
             f=partial,

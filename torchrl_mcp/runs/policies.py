@@ -1,4 +1,4 @@
-"""Trained policies: restored from a run folder or checkpoint file, evaluated and published."""
+"""Restores, evaluates and publishes trained policies."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ def policy_config(path: Path) -> DictConfig:
         path: Run folder, for its newest checkpoint, or checkpoint file.
 
     Raises:
-        ValueError: If there is no checkpoint, or it is damaged or from another version of the library.
+        ValueError: If there is no checkpoint, or the checkpoint is damaged or from another version of the library.
     """
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
@@ -41,15 +41,15 @@ def restore(
     """Return configuration, trained agent and new environments from a run folder or checkpoint file.
 
     Args:
-        path: Run folder, for its newest checkpoint, or checkpoint file. Published files have no critic that does
-            not act; it is then untrained.
+        path: Run folder, for its newest checkpoint, or checkpoint file. Published files lack the critic unless it
+            chooses the option; the critic is then untrained.
         num_envs: Number of environments.
         seed: Seed of the environments.
         device: Device of the networks.
-        **kwargs: Arguments of the environments that replace the run's own.
+        **kwargs: Arguments of the environments that replace the run's arguments.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or it names classes that cannot be imported.
+        ValueError: If there is no checkpoint, or the checkpoint is damaged or names classes that cannot be imported.
     """
     file = checkpoint.find(Path(path))
     cfg = policy_config(file)
@@ -65,23 +65,24 @@ def restore(
 def publish_run(path: Path, output: Path) -> None:
     """Write the policy of a run as a separate checkpoint file, as small as the built-in networks.
 
-    The file leaves out the frozen parts if a built-in network has the same in bfloat16, bit for bit.
+    The file omits the frozen parts if a built-in network has the same parts in bfloat16, bit for bit.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         output: The file to write.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or the frozen parts differ from the built-in network.
+        ValueError: If there is no checkpoint, the checkpoint is damaged, or the run transferred from a built-in network
+            whose frozen parts have changed since.
     """
     cfg, agent, _ = restore(path, num_envs=1, seed=0)
-    cfg.run_dir = cfg.run_root = "."  # older runs have the folder where they began, which is of no use to others
+    cfg.run_dir = cfg.run_root = "."  # older runs store the folder in which they began, which means nothing elsewhere
     parts = nn.ModuleDict({name: part for name, part in agent.parts.items() if name not in agent.spare_parts})
     shared: dict[str, str] = {}
     if cfg.stage.name == "transfer":
         try:
             shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
-        except ValueError:  # other networks, which the file then holds
+        except ValueError:  # the frozen parts are not built in, so the file contains them
             if cfg.pretrained == "builtin":
                 raise
     config = cast("dict[str, Any]", OmegaConf.to_container(cfg))
@@ -94,17 +95,18 @@ def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[s
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
-        episodes: Episodes, one per environment.
+        episodes: Number of episodes, one per environment.
         seed: Seed of environments and sampling.
-        **kwargs: Arguments of the environments, beside those that the run's configuration has for evaluations.
+        **kwargs: Arguments of the environments, in addition to the run's settings for evaluations.
 
     Returns:
-        ``episodes``, ``seed``, the arguments of the ``environment`` that replaced the run's own, and for the policy
-        ``deterministic`` and ``stochastic``, the :func:`~torchrl_mcp.evaluation.rollout.episode_statistics`, with the
+        ``episodes``; ``seed``; ``environment``, the arguments that replaced the run's arguments; and, both for the
+        ``deterministic`` and the ``stochastic`` policy, the
+        :func:`~torchrl_mcp.evaluation.rollout.episode_statistics`, with the
         :func:`~torchrl_mcp.evaluation.diagnostics.diagnostics` of gates and options as ``diagnostics``.
 
     Raises:
-        ValueError: If there is no checkpoint or it is damaged.
+        ValueError: If there is no checkpoint, or the checkpoint is damaged.
     """
     settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     environment = {**settings["environment"], **kwargs}
@@ -127,30 +129,30 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> li
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Number of episodes per clip.
         seed: Seed of the environments.
-        **kwargs: Arguments of the environments that replace the run's own.
+        **kwargs: Arguments of the environments that replace the run's arguments.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+        ValueError: If there is no checkpoint, the checkpoint is damaged, or the task is not imitation.
     """
     agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **kwargs)
     return follow_each(agent.actor.policy, env)
 
 
 def restore_for_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> tuple[Agent, Imitation]:
-    """Return a run's agent and new environments, in each of which an episode follows one clip and ends with it.
+    """Return a run's agent and new environments, in which every episode follows a single clip and ends with it.
 
     Args:
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Number of environments per clip.
         seed: Seed of the environments.
-        **kwargs: Arguments of the environments that replace the run's own.
+        **kwargs: Arguments of the environments that replace the run's arguments.
 
     Raises:
-        ValueError: If there is no checkpoint, it is damaged, or the task is not imitation.
+        ValueError: If there is no checkpoint, the checkpoint is damaged, or the task is not imitation.
     """
     _, _, env = restore(path, num_envs=1, seed=seed, **kwargs)
     if not hasattr(env, "library"):
-        raise ValueError(f"{path} follows no motions: only runs of task=imitation can be evaluated clip by clip")
-    alone = {**kwargs, "switch_interval": math.inf, "clip_end": "truncate"}
-    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, **alone)
+        raise ValueError(f"{path} must be a run of task=imitation: other tasks have no clips to evaluate")
+    single_clip = {**kwargs, "switch_interval": math.inf, "clip_end": "truncate"}
+    _, agent, env = restore(path, num_envs=episodes * len(env.library), seed=seed, **single_clip)
     return agent, cast("Imitation", env)

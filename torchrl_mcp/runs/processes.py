@@ -1,4 +1,4 @@
-"""Functions that run in parallel, each in its own process."""
+"""Runs functions in parallel, each in its own process."""
 
 import multiprocessing
 import sys
@@ -17,16 +17,16 @@ def start(function: Callable[..., None], *args: Any) -> BaseProcess:
 
 
 def ticks(processes: Sequence[BaseProcess], interval: float) -> Iterator[None]:
-    """Yield every ``interval`` seconds while any of the processes runs, and once more after they have ended.
+    """Yield every ``interval`` seconds while any process runs, and once more after all have ended.
 
     Raises:
-        ValueError: If a process fails; the reason is on the terminal.
+        ValueError: If a process fails; the process prints the reason to standard error.
     """
     while running := [process for process in processes if process.is_alive()]:
         yield
         running[0].join(interval)
         if any(process.exitcode for process in processes):
-            raise ValueError("one of the processes has failed, for the reason above; finished work is kept")
+            raise ValueError("a process has failed for the reason above; finished work is kept")
     yield
 
 

@@ -1,4 +1,4 @@
-"""The provenance of a run: command, code, choices and machine."""
+"""Records the provenance of a run: command, code, choices and machine."""
 
 import os
 import platform
@@ -18,11 +18,13 @@ from torchrl_mcp import __version__
 from torchrl_mcp.training.precision import Precision
 
 PACKAGE = Path(__file__).resolve().parents[1]
+"""Folder of the library."""
 
 CPUINFO = Path("/proc/cpuinfo")
+"""Linux's description of the processors."""
 
 INSTRUCTIONS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")
-"""Instruction sets on which torch's speed on a CPU depends; the last two are for bfloat16."""
+"""Instruction sets on which torch's speed on a CPU depends; the last two concern bfloat16."""
 
 
 def provenance(device: str, precision: Precision, inputs: Mapping[str, str]) -> dict[str, Any]:
@@ -34,9 +36,9 @@ def provenance(device: str, precision: Precision, inputs: Mapping[str, str]) -> 
         inputs: Digests of the files outside the run folder, by the names of their settings.
 
     Returns:
-        ``command``; ``commit`` of the library, with ``-dirty`` if files were changed since, or None without a
-        checkout; its ``version``; ``choices``; ``precision`` and the reason for it; ``inputs``; ``started``, an ISO
-        time; and the ``machine``.
+        ``command``; ``commit`` of the library, with ``-dirty`` if files have changed since, or None without a checkout;
+        ``version`` of the library; ``choices`` of config groups; ``precision`` with the reason for it; ``inputs``;
+        ``started``, an ISO time; and ``machine``.
     """
     command, choices = launched()
     return {
@@ -52,28 +54,28 @@ def provenance(device: str, precision: Precision, inputs: Mapping[str, str]) -> 
 
 
 def continuation(origin: Mapping[str, Any], planned: int, total: int, frames: int) -> dict[str, Any]:
-    """Return the provenance of a run whose length is no longer the planned one.
+    """Return the provenance of a run whose length changes.
 
     Args:
         origin: The provenance so far.
-        planned: Environment steps of the run so far.
-        total: Environment steps of the run from now on.
-        frames: Environment steps that it has taken.
+        planned: Environment steps of the run as planned so far.
+        total: Environment steps of the run as planned from now on.
+        frames: Environment steps that the run has taken.
 
     Returns:
-        ``origin`` with one more entry in ``extended``.
+        ``origin`` with a further entry in ``extended``.
     """
     entry = {"command": launched()[0], "started": _now(), "planned": planned, "total_frames": total, "after": frames}
     return {**origin, "extended": [*origin.get("extended", []), entry]}
 
 
 def launched() -> tuple[list[str], dict[str, str]]:
-    """Return command line and choices of config groups, of the run that Hydra launched or of this process."""
+    """Return command line and choices of config groups, of the run that Hydra launched or else of this process."""
     if not HydraConfig.initialized():
         return list(sys.argv), {}
     hydra = HydraConfig.get()
-    made = hydra.runtime.choices.items()
-    choices = {group: choice for group, choice in made if choice and not group.startswith("hydra/")}
+    groups = hydra.runtime.choices.items()
+    choices = {group: choice for group, choice in groups if choice and not group.startswith("hydra/")}
     return ["torchrl-mcp-train", *hydra.overrides.task], choices
 
 
@@ -81,7 +83,7 @@ def commit(folder: Path) -> str | None:
     """Return the abbreviated commit of the Git checkout that tracks ``folder``, or None."""
     if shutil.which("git") is None:
         return None
-    # An installed package may lie inside an unrelated checkout, which does not track it.
+    # An installed package may lie inside the checkout of another project, which does not track the package.
     if not _git(folder, "ls-files", "."):
         return None
     return _git(folder, "describe", "--always", "--dirty", "--exclude=*")
@@ -97,12 +99,12 @@ def _now() -> str:
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Describe this machine, JSON-compatible.
+    """Return a description of this machine, JSON-compatible.
 
     Returns:
-        ``processor``, the model; ``instructions``, the available ones of :data:`INSTRUCTIONS`, separated by spaces
-        (empty if unknown); ``cores``, the number that this process may use; ``device``, the model of a GPU or
-        ``device`` itself; and the versions of ``python``, ``torch``, ``torchrl`` and ``mujoco``.
+        ``processor``, its model; ``instructions``, the available ones of :data:`INSTRUCTIONS` separated by spaces, or
+        an empty text if unknown; ``cores``, the number that this process may use; ``device``, the model of the GPU or
+        else ``device`` itself; and the versions of ``python``, ``torch``, ``torchrl`` and ``mujoco``.
     """
     facts = _cpuinfo()
     flags = facts.get("flags", "").split()
@@ -113,7 +115,7 @@ def machine(device: str) -> dict[str, Any]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "device": torch.cuda.get_device_name(device) if on_gpu else device,
         "python": platform.python_version(),
-        "torch": str(torch.__version__),  # with the build, which the version of the package leaves out
+        "torch": str(torch.__version__),  # includes the build, which the version of the package omits
         **{name: version(name) for name in ("torchrl", "mujoco")},
     }
 

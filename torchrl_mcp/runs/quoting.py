@@ -1,10 +1,10 @@
-"""Settings and commands as text that can be pasted into a shell."""
+"""Quotes settings and commands, so that they can be pasted into a shell."""
 
 import re
 import shlex
 
 PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)(\.{0,2}/|[a-z_])[\w/.@+-]*", re.ASCII | re.IGNORECASE)
-"""Texts that Hydra reads as such without quotes."""
+"""Texts that Hydra reads as text without quotes."""
 
 
 def setting(name: str, value: object) -> str:
@@ -17,10 +17,10 @@ def setting(name: str, value: object) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as Hydra reads it, in quotes if it needs them."""
+    """Return a text for Hydra's command line, in quotes if Hydra would otherwise read it differently."""
     if PLAIN.fullmatch(text):
         return text
-    # Within quotes Hydra reads backslashes literally, except before a quote, also before the closing one.
+    # Within quotes Hydra reads backslashes literally, except before a quote, including the closing quote.
     escaped = re.sub(r'(\\*)("|$)', lambda match: match[1] * 2 + (r"\"" if match[2] else ""), text)
     return f'"{escaped}"'
 
@@ -30,7 +30,7 @@ def command(name: str, *words: object) -> str:
 
     Args:
         name: The command's name without ``torchrl-mcp-``.
-        words: Its arguments; settings come from :func:`setting`.
+        words: Arguments of the command; settings come from :func:`setting`.
 
     >>> print(command("play", "runs/my run"))
     torchrl-mcp-play 'runs/my run'

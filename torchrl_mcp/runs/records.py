@@ -1,4 +1,4 @@
-"""The record of a run in its folder: its configuration and its origin, and whether another run is the same."""
+"""Reads and writes the record of a run, its configuration and its provenance, and compares it with other runs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,16 +21,16 @@ def run_config(folder: Path) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
     Raises:
-        ValueError: If the folder holds no run, or one of another version of the library.
+        ValueError: If the folder holds no run, or a run of another version of the library.
     """
-    return located(_held(folder), folder)
+    return located(_stored_config(folder), folder)
 
 
 def located(config: Mapping[str, Any], folder: Path) -> DictConfig:
-    """Return the configuration of the run in ``folder`` from a stored one, as :func:`replanned` returns.
+    """Return the configuration of the run in ``folder`` from its stored form, which :func:`replanned` returns.
 
     Raises:
-        ValueError: If it is of another version of the library.
+        ValueError: If the run is of another version of the library.
     """
     require_known(config, folder / CONFIG)
     return OmegaConf.create(places.located(config, folder))
@@ -41,7 +41,7 @@ def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
 
     Args:
         folder: The run folder.
-        cfg: Its configuration, or None to read it.
+        cfg: Configuration of the run, or None to read it from the folder.
 
     Raises:
         ValueError: If the folder holds no run.
@@ -52,21 +52,21 @@ def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
 
 
 def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
-    """Return the settings in which the run in ``folder`` differs from a configuration, so that it is another run.
+    """Return the settings which make the run in ``folder`` a different run from the run of a configuration.
 
-    Files and folders outside the run folder are compared by their content, if both are known.
+    Files and folders outside the run folder are compared by their content, if the content of both is known.
 
     Args:
         folder: The run folder.
         config: The configuration of a :class:`.configuration.Plan`.
 
     Raises:
-        ValueError: If the folder holds no run, or one of another version of the library.
+        ValueError: If the folder holds no run, or a run of another version of the library.
     """
     stored = places.stored(run_config(folder))
     inputs = _origin(folder).get("inputs", {})
-    other = [name for name, mark in places.digests(config).items() if inputs.get(name, mark) != mark]
-    return list(dict.fromkeys([*differences(stored, config), *other]))
+    changed_files = [name for name, mark in places.digests(config).items() if inputs.get(name, mark) != mark]
+    return list(dict.fromkeys([*differences(stored, config), *changed_files]))
 
 
 def require_free(folder: Path, config: Mapping[str, Any]) -> None:
@@ -74,40 +74,42 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
 
     Args:
         folder: The run folder.
-        config: The configuration that is to run there.
+        config: The configuration of the run that will use the folder.
 
     Raises:
-        ValueError: If it holds one, with the settings in which that differs.
+        ValueError: If the folder holds a run; the message names the settings in which the two runs differ.
     """
     if (folder / CONFIG).exists():
         if not run_folder.find_all(folder):
             raise ValueError(f"{folder} holds a run without checkpoints: give another run_dir, or remove the folder")
-        changed = changes(folder, config)
-        other = f"a run that differs in {', '.join(changed)}: " if changed else ""
-        remedy = "" if changed else f"this run already: continue it with {resuming(folder)}, or "
-        raise ValueError(f"{folder} holds {other or remedy}give another run_dir")
+        if changed := changes(folder, config):
+            raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_dir")
+        raise ValueError(
+            f"{folder} already holds this run: continue it with {resuming(folder)}, or give another run_dir"
+        )
     if any(run_folder.frames(path) for path in run_folder.find_all(folder)) or run_folder.read_metrics(folder):
         raise ValueError(
-            f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: put that back to continue the "
-            "run, or give another run_dir"
+            f"{folder} holds metrics or checkpoints of a run whose {CONFIG} is missing: restore {CONFIG} to continue "
+            "the run, or give another run_dir"
         )
 
 
 def require_same_character(folder: Path, config: Mapping[str, Any]) -> None:
-    """Check that a character of one's own is the one with which a run began.
+    """Check that the file of a user's character has not changed since the run began.
 
     Args:
         folder: The run folder.
         config: The run's configuration.
 
     Raises:
-        ValueError: If its file was changed.
+        ValueError: If the file has changed.
     """
-    now, began = (marks.get("character") for marks in (places.digests(config), _origin(folder).get("inputs", {})))
-    if None not in (now, began) and now != began:
+    current = places.digests(config).get("character")
+    recorded = _origin(folder).get("inputs", {}).get("character")
+    if None not in (current, recorded) and current != recorded:
         name = config["character"]["name"]
         raise ValueError(
-            f"the file of character={name} was changed since {folder} began: put the file back, or start a new run"
+            f"the file of character={name} has changed since {folder} began: restore the file, or start a new run"
         )
 
 
@@ -116,41 +118,43 @@ def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None
 
     Args:
         folder: The run folder.
-        config: The configuration as it is stored.
+        config: The configuration in its stored form.
         precision: Precision of the networks, and the reason for it.
     """
     write_json(provenance(config["device"], precision, places.digests(config)), folder / PROVENANCE)
-    # Last, because the presence of this file means that there is a run to resume.
+    # This file is written last, because its presence means that the run can be resumed.
     _write_config(config, folder)
 
 
 def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) -> dict[str, Any]:
-    """Return the stored configuration of a run with another length, and other places of files outside its folder.
+    """Return the stored configuration of a run, with a new length and new places of files outside its folder.
 
     Args:
         folder: The run folder.
-        total_frames: Environment steps of the whole run, or None for as many as planned.
+        total_frames: Environment steps of the whole run, or None for the planned number.
         moves: New places, by the names of their settings; names that the run lacks are ignored.
 
     Raises:
-        ValueError: If the folder holds no run, or another length is no number of steps or less than the run has taken.
+        ValueError: If the folder holds no run, or ``total_frames`` is not a number of steps or less than the run has
+            taken.
     """
-    config = _held(folder)
+    config = _stored_config(folder)
     planned = config["training"]["total_frames"]
     total = planned if total_frames is None else total_frames
     if wrong := list(wrong_values({"training": {"total_frames": total}})):
         raise ValueError(wrong[0])
     if total != planned and total < (taken := run_folder.frames(checkpoint.find(folder))):
-        raise ValueError(f"training.total_frames={total}: {folder} has taken {taken} steps; give as many or more")
-    known = places.outside(config)
-    new = {known[name]: str(Path(place).absolute()) for name, place in moves.items() if name in known}
-    return {**places.moved(config, new), "training": {**config["training"], "total_frames": total}}
+        raise ValueError(f"training.total_frames={total} must be at least {taken}, the steps that {folder} has taken")
+    files = places.outside(config)
+    new_places = {files[name]: str(Path(place).absolute()) for name, place in moves.items() if name in files}
+    return {**places.moved(config, new_places), "training": {**config["training"], "total_frames": total}}
 
 
 def store(folder: Path, config: Mapping[str, Any]) -> None:
-    """Store a configuration of a run as :func:`replanned`, and its provenance."""
-    stored = _held(folder)
-    planned, total = (one["training"]["total_frames"] for one in (stored, config))
+    """Store a configuration from :func:`replanned` in a run folder, and add a change of length to the provenance."""
+    stored = _stored_config(folder)
+    planned = stored["training"]["total_frames"]
+    total = config["training"]["total_frames"]
     if config != stored:
         _write_config(config, folder)
     if total != planned:
@@ -162,47 +166,53 @@ def require_same_run(cfg: DictConfig, path: Path) -> None:
     """Check that a checkpoint belongs to the run with the configuration ``cfg``, whose ``total_frames`` may differ.
 
     Raises:
-        ValueError: If it belongs to another run.
+        ValueError: If the checkpoint belongs to another run.
     """
-    saved, wanted = (
-        {**config, "training": {**config["training"], "total_frames": None}}
-        for config in (checkpoint.saved_config(path), places.stored(cfg))
-    )
+    saved = _without_length(checkpoint.saved_config(path))
+    wanted = _without_length(places.stored(cfg))
     if changed := differences(saved, wanted, SAME_RUN | {"pretrained", "evaluation", "budget"}):
         raise ValueError(
-            f"{path} is not of this run: it differs from {CONFIG} in {', '.join(changed)}. Put this run's own "
-            "checkpoint back, or remove the file to go on from the one before"
+            f"{path} belongs to another run: it differs from {CONFIG} in {', '.join(changed)}. Restore the checkpoint "
+            "of this run, or remove the file to continue from the previous checkpoint"
         )
 
 
+def _without_length(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {**config, "training": {**config["training"], "total_frames": None}}
+
+
 def elsewhere(folder: Path, cfg: DictConfig) -> str:
-    """Return a message if a run that is to be resumed began on another machine, empty if it did not."""
+    """Return a message if a run continues on another machine, or an empty text if it continues on the same one."""
     precision = name(choose(cfg.autocast, cfg.device).autocast)
-    began = _origin(folder).get("machine", {})
-    now = machine(cfg.device)
-    if all(began.get(part) in (None, now[part]) for part in ("processor", "device")):
+    first = _origin(folder).get("machine", {})
+    current = machine(cfg.device)
+    if all(first.get(part) in (None, current[part]) for part in ("processor", "device")):
         return ""
     return (
-        f" on {now['processor']} ({now['device']}), after it began on {began['processor']} ({began['device']}), with "
-        f"networks in {precision} as it began"
+        f" on {current['processor']} ({current['device']}), after it began on {first['processor']} "
+        f"({first['device']}), with networks in {precision} as before"
     )
 
 
-def _held(folder: Path) -> dict[str, Any]:
-    """Return the configuration in a run folder as it is stored."""
+def _stored_config(folder: Path) -> dict[str, Any]:
+    """Return the configuration in a run folder in its stored form.
+
+    Raises:
+        ValueError: If the folder holds no run, or the configuration is damaged.
+    """
     if not (folder / CONFIG).is_file():
         raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
     config = read_config(folder / CONFIG)
     if missing := [name for name in ("task", "stage", "training") if name not in config]:
         raise ValueError(
-            f"{folder / CONFIG} is damaged, because it lacks {', '.join(missing)}: put it back from a copy, or give "
-            "another run_dir"
+            f"{folder / CONFIG} is damaged, because it lacks {', '.join(missing)}: restore the file from a copy, or "
+            "give another run_dir"
         )
     return config
 
 
 def _is_evaluated(folder: Path) -> bool:
-    """Return whether a run folder has an evaluation that can be read; another is made anew."""
+    """Return whether a run folder has a readable evaluation; an unreadable one is repeated."""
     try:
         return bool(read_json(folder / EVALUATION))
     except (OSError, ValueError):
@@ -210,7 +220,7 @@ def _is_evaluated(folder: Path) -> bool:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    """Return the provenance of the run in a folder, empty for older runs."""
+    """Return the provenance of the run in a folder, which is empty for older runs."""
     return read_json(folder / PROVENANCE) if (folder / PROVENANCE).is_file() else {}
 
 

@@ -1,4 +1,4 @@
-"""What a run needs beside valid settings: an environment, files, devices, networks, and classes that exist."""
+"""Checks what a run needs besides valid settings: an environment, files, devices, networks, and existing classes."""
 
 import difflib
 import inspect
@@ -21,10 +21,10 @@ from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.runs.trust import require_trusted, targets
 
 SHARED = {name: name for name in ("seed", "device", "physics", "num_threads")} | {"num_envs": "training.num_envs"}
-"""Arguments of environments that settings of the run give, by these."""
+"""Arguments of environments that come from settings of the run, with the names of these settings."""
 
 EVALUATED = SHARED | {"seed": "evaluation.seed", "num_envs": "evaluation.episodes"}
-"""The same of environments that evaluate, which simulate on the CPU."""
+"""The same arguments for environments that evaluate, which simulate on the CPU."""
 
 
 SIMULATION = frozenset({"device", "num_threads", "physics", "pin_memory"})
@@ -32,10 +32,11 @@ SIMULATION = frozenset({"device", "num_threads", "physics", "pin_memory"})
 
 
 def require_all(cfg: DictConfig) -> None:
-    """Check, before its folder is made or used, that a run can be made on this machine.
+    """Check that a run can be executed on this machine, before its folder is created or used.
 
     Raises:
-        ValueError: As the functions below, of which the last checks that there are networks to transfer.
+        ValueError: As the functions below, or if a setting of the environments would have no effect, or transfer lacks
+            a pre-training.
     """
     require_environment(cfg)
     require_callable(cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)))
@@ -45,11 +46,11 @@ def require_all(cfg: DictConfig) -> None:
         if unread := [name for name in given if name in (cfg.task.get(section) or ())]:
             raise ValueError(f"task.{section}.{unread[0]} would have no effect: pass {given[unread[0]]} instead")
     if cfg.stage.name == "transfer" and cfg.transfer.keep and cfg.pretrained is None:
-        ours = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
+        is_builtin = (FOLDER / f"{cfg.method.name}-{cfg.character.name}.torchrl").is_file()
         raise ValueError(
             f"stage=transfer needs the pre-training of method={cfg.method.name}: run it with stage=pretrain first and "
             "give its run folder as pretrained=<folder>"
-            + (", or take the networks that come with the library: pretrained=builtin" if ours else "")
+            + (", or use the networks that come with the library: pretrained=builtin" if is_builtin else "")
             + "; benchmark=table2 runs both stages of several methods"
         )
 
@@ -58,7 +59,7 @@ def require_environment(cfg: DictConfig) -> None:
     """Check that there is an environment for the configured task, stage and character.
 
     Raises:
-        ValueError: If there is none, or this version lacks a class that the configuration names.
+        ValueError: If there is no such environment, or a class that the configuration names cannot be imported.
     """
     task = cfg.task.name
     character = cfg.character.name
@@ -69,30 +70,30 @@ def require_environment(cfg: DictConfig) -> None:
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "
             f"task={task} with stage=transfer and pretrained=<folder of the pre-training>, or pretrained=builtin"
         )
-    # Import everything that is named: importing a user's motions may register the user's character.
+    # Import everything that the configuration names: importing a user's motions may register the user's character.
     names = targets(OmegaConf.to_container(cfg.task[cfg.stage.name], resolve=True))
     if "_target_" not in cfg.task[cfg.stage.name]:
         raise ValueError(
-            f"task.{cfg.stage.name} of task={task} has no settings of its own: give task.pretrain.NAME=VALUE, which "
-            "holds in both stages"
+            f"task.{cfg.stage.name} of task={task} has no separate settings: give task.pretrain.NAME=VALUE, which "
+            "applies to both stages"
         )
     for name in names:
         _resolved(name)
     environment = _resolved(cfg.task[cfg.stage.name]["_target_"])
-    able: tuple[str, ...] = getattr(environment, "characters", tuple)()
-    if able and character not in able:
-        known = " or ".join(able)
-        raise ValueError(f"no environment has task={task} with character={character}: pass character={known}")
+    characters: tuple[str, ...] = getattr(environment, "characters", tuple)()
+    if characters and character not in characters:
+        choices = " or ".join(characters)
+        raise ValueError(f"no environment has task={task} with character={character}: pass character={choices}")
 
 
 def require_callable(config: Mapping[str, Any]) -> None:
-    """Check that the library's classes and functions in a configuration take the arguments that it gives them.
+    """Check that the library's classes and functions take the arguments that a configuration gives them.
 
     Args:
-        config: The configuration, without references.
+        config: The configuration, with resolved references.
 
     Raises:
-        ValueError: If one does not, with the nearest that it takes.
+        ValueError: If an argument is unknown; the message names the most similar arguments.
     """
     settings = list(leaves(config))
     for setting, name in settings:
@@ -103,8 +104,8 @@ def require_callable(config: Mapping[str, Any]) -> None:
         taken = arguments(name)
         unknown = [key for key in given if key not in taken and not key.startswith("_")]
         if unknown and not any(map(_is_open, taken.values())):
-            near = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
-            raise ValueError(f"{group}{unknown[0]} is not an argument of {name}; the nearest are: {', '.join(near)}")
+            similar = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
+            raise ValueError(f"{group}{unknown[0]} is not an argument of {name}: use one of {', '.join(similar)}")
 
 
 def require_files(cfg: DictConfig, task: DictConfig) -> None:
@@ -115,19 +116,19 @@ def require_files(cfg: DictConfig, task: DictConfig) -> None:
         task: Configuration of the environments.
 
     Raises:
-        ValueError: If one is missing, with the settings that give a new place.
+        ValueError: If a file is missing; the message names the settings that give its new place.
     """
     files = places.settings(OmegaConf.to_container(task, resolve=True))
     missing = {value: name for name, value in files if not Path(value).exists()}
     if not missing:
         return
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    named = {value: name for name, value in places.outside(config).items()}
+    names = {value: name for name, value in places.outside(config).items()}
     value, argument = next(iter(missing.items()))
-    name = named.get(value, f"task.{cfg.stage.name}.{argument}")
+    name = names.get(value, f"task.{cfg.stage.name}.{argument}")
     raise ValueError(
-        f"{name}={value} does not exist: put it back, or give its new place by {name}=PATH, with resume= by "
-        f"+{name}=PATH, and to torchrl-mcp-play and torchrl-mcp-evaluate by --task {argument}=PATH"
+        f"{name}={value} does not exist: restore it, or give its new place: {name}=PATH for a new run, +{name}=PATH "
+        f"with resume=, or --task {argument}=PATH for torchrl-mcp-play and torchrl-mcp-evaluate"
     )
 
 
@@ -135,21 +136,25 @@ def require_equipment(cfg: DictConfig) -> None:
     """Check that this machine has the configured device and logger.
 
     Raises:
-        ValueError: If one is missing.
+        ValueError: If the device or the package of the logger is missing, or the physics engine cannot simulate the
+            task.
     """
     try:
         kind_of_device = torch.device(cfg.device).type
     except RuntimeError as error:
-        raise ValueError(f"torch does not know device={cfg.device}: pass cpu or cuda") from error
+        raise ValueError(f"device={cfg.device} is not a device of torch: pass cpu or cuda") from error
     if kind_of_device == "mps":
-        raise ValueError(f"device={cfg.device} has no float64, which normalisers count in: pass cpu or cuda")
+        raise ValueError(f"device={cfg.device} lacks float64, in which normalisers count: pass cpu or cuda")
     if kind_of_device == "cuda" and not torch.cuda.is_available():
         raise ValueError(
             f"device={cfg.device}: torch {torch.__version__} finds no CUDA device. Pass device=cpu, or install a CUDA "
             "build of torch on a machine with a GPU"
         )
     if cfg.physics.on_device and "physics" not in arguments(cfg.task[cfg.stage.name]["_target_"]):
-        raise ValueError(f"physics=warp cannot simulate task={cfg.task.name}, whose physics is its own: pass mujoco")
+        raise ValueError(
+            f"physics=warp cannot simulate task={cfg.task.name}, which uses another library's physics: pass "
+            "physics=mujoco"
+        )
     if cfg.physics.on_device and "num_workers" in cfg.collector:
         raise ValueError("physics=warp simulates all environments at once, without workers: pass collector=local")
     kind = cfg.logger.logger_type if cfg.logger else "csv"
@@ -165,61 +170,61 @@ def require_known(config: Mapping[str, Any], source: Path) -> None:
         source: The file of the configuration.
 
     Raises:
-        ValueError: If one is missing or not trusted.
+        ValueError: If a class or function is missing or not trusted.
     """
     names = list(targets(config))
-    # Importing the library's own modules runs no other code, so it is safe before the check of trust.
+    # Importing modules of this library runs no other code, so it is safe before the check of trust.
     if missing := [name for name in names if name.startswith("torchrl_mcp.") and not _exists(name)]:
         raise ValueError(
-            f"{source} is of another version of torchrl-mcp: this version has no {missing[0]}. "
-            "Use the version that wrote it, whose commit is in the run folder's origin.json, or train again"
+            f"{source} is from another version of torchrl-mcp: this version lacks {missing[0]}. Use the version that "
+            "wrote the file, whose commit is in the run folder's origin.json, or train again"
         )
     require_trusted(config, source)
     if missing := [name for name in names if not _exists(name)]:
         raise ValueError(
-            f"{source} names {missing[0]}, which Python does not find: if the module is yours, run the command in its "
-            "folder, or add its folder to PYTHONPATH"
+            f"{source} names {missing[0]}, which Python does not find: if the module is yours, run the command in the "
+            "module's folder, or add this folder to PYTHONPATH"
         )
 
 
 def require_arguments(name: str, given: Collection[str]) -> None:
-    """Check that a task takes arguments.
+    """Check that the class of a task takes arguments.
 
     Args:
-        name: Name of the task's class, or of another function, which is not checked.
+        name: Name of the class. Functions that make environments are not checked.
         given: Names of the arguments.
 
     Raises:
-        ValueError: If it does not, with those that it takes.
+        ValueError: If an argument is unknown; the message lists the arguments that the task takes.
     """
     if not inspect.isclass(pkgutil.resolve_name(name)):
         return
     taken = arguments(name)
     if unknown := [argument for argument in given if argument not in taken]:
-        tasks_own = {*inspect.signature(CharacterEnv.__init__).parameters} - {"max_episode_steps"}
-        listed = sorted({*taken} - tasks_own - {"kwargs", "character"})
-        raise ValueError(f"the task has no argument {' and no '.join(unknown)}: it takes {', '.join(listed)}")
+        common = {*inspect.signature(CharacterEnv.__init__).parameters} - {"max_episode_steps"}
+        listed = sorted({*taken} - common - {"kwargs", "character"})
+        raise ValueError(f"the task has no argument {' and no '.join(unknown)}: use some of {', '.join(listed)}")
 
 
 def require_entry(env: Environments, name: str) -> slice:
-    """Return the place of an entry in an environment's goal.
+    """Return the range of an entry in an environment's goal.
 
     Raises:
         ValueError: If the goal has no such entry.
     """
     layout = env.goal_layout
     if name not in layout or len(layout) == 1:
-        known = f"has {', '.join(layout)}" if len(layout) > 1 else "is one entry: leave it out"
-        raise ValueError(f"transfer.goal_entry={name} is not an entry of the task's goal, which {known}")
+        remedy = f"use one of {', '.join(layout)}" if len(layout) > 1 else "omit it, because the goal has no parts"
+        raise ValueError(f"transfer.goal_entry={name} is not an entry of the task's goal: {remedy}")
     return layout[name]
 
 
 def applicable(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments given to environments without those of a simulation that they do not take.
+    """Return arguments of environments without the arguments for simulations that these environments do not take.
 
     Args:
         name: Name of the class or function that makes the environments.
-        given: Their arguments.
+        given: The arguments.
     """
     taken = arguments(name)
     if any(map(_is_open, taken.values())):
@@ -228,15 +233,18 @@ def applicable(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def arguments(name: str) -> dict[str, inspect.Parameter]:
-    """Return the parameters of a class or function by its name, with those that a class passes on to its bases.
+    """Return the parameters of a class or function, including parameters that a class passes on to its bases.
 
-    There is a parameter ``**kwargs`` among them if no base refuses unknown arguments.
+    A parameter ``**kwargs`` is among them only if no base refuses unknown arguments.
+
+    Args:
+        name: Dotted name of the class or function.
     """
-    made = pkgutil.resolve_name(name)
-    kinds = made.__mro__ if inspect.isclass(made) else ()
+    target = pkgutil.resolve_name(name)
+    classes = target.__mro__ if inspect.isclass(target) else ()
     parameters_by_name: dict[str, inspect.Parameter] = {}
-    for maker in [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [made]:
-        parameters = inspect.signature(maker).parameters
+    for function in [vars(base)["__init__"] for base in classes if "__init__" in vars(base)] or [target]:
+        parameters = inspect.signature(function).parameters
         parameters_by_name = {**parameters, **parameters_by_name}
         if not any(map(_is_open, parameters.values())):
             return {name: parameter for name, parameter in parameters_by_name.items() if not _is_open(parameter)}
@@ -248,14 +256,14 @@ def _is_open(parameter: inspect.Parameter) -> bool:
 
 
 def import_own(module: str, origin: str) -> None:
-    """Import a module of the user's, which adds characters to the library's.
+    """Import a module of the user, which adds characters to the library.
 
     Args:
-        module: Its name.
-        origin: What names it, the beginning of an error.
+        module: Name of the module.
+        origin: Beginning of error messages, which tells where the module is named.
 
     Raises:
-        ValueError: If there is no such module, it is no Python, or Python finds another one of this name.
+        ValueError: If the module does not exist, is not valid Python, or Python has another module of this name.
     """
     top = module.partition(".")[0]
     try:
@@ -264,41 +272,45 @@ def import_own(module: str, origin: str) -> None:
         raise ValueError(f"{origin} {module}, which is not valid Python: {error}") from error
     except ModuleNotFoundError as error:
         if error.name != top:
-            _require_own(top, f"{origin} {module}")
+            _require_no_conflict(top, f"{origin} {module}")
             raise
         raise ValueError(
-            f"{origin} {module}, which Python does not find: call from the folder of {module}.py, or add that to "
-            "PYTHONPATH"
+            f"{origin} {module}, which Python does not find: run the command in the folder of {module}.py, or add this "
+            "folder to PYTHONPATH"
         ) from error
-    _require_own(top, f"{origin} {module}")
+    _require_no_conflict(top, f"{origin} {module}")
 
 
 def _resolved(name: str) -> Any:
-    """Return what a configuration names, which may be the user's.
+    """Return the class or function with a name in a configuration, which may be defined by the user.
 
     Raises:
-        ValueError: If Python does not find it, or finds another module of the name of the user's.
+        ValueError: If Python does not find it, or another module has the name of the user's module.
     """
     try:
         return pkgutil.resolve_name(name)
     except (AttributeError, ImportError) as error:
         if (top := name.partition(".")[0]) in sys.modules:
-            _require_own(top, f"the configuration names {name}")
+            _require_no_conflict(top, f"the configuration names {name}")
         raise ValueError(
-            f"the configuration names {name}, which Python cannot import: {error}. If the module is yours, call from "
-            "its folder, or add that to PYTHONPATH"
+            f"the configuration names {name}, which Python cannot import: {error}. If the module is yours, run the "
+            "command in its folder, or add this folder to PYTHONPATH"
         ) from error
 
 
-def _require_own(module: str, origin: str) -> None:
-    """Check that an imported module is the one in the working directory, if there is one, and none of Python's."""
+def _require_no_conflict(module: str, origin: str) -> None:
+    """Check that an imported module is the module of this name in the working directory, and not one of Python's.
+
+    Raises:
+        ValueError: If Python has imported another module of this name.
+    """
     file = next((path for path in (Path(f"{module}.py"), Path(module, "__init__.py")) if path.exists()), None)
     imported = getattr(sys.modules[module], "__file__", None)
     if file is None and module not in sys.stdlib_module_names:
         return
     if file is None or imported is None or not file.samefile(imported):
         raise ValueError(
-            f"{origin}, but Python has another module {module}{f', {imported}' if imported else ''}: rename yours"
+            f"{origin}, but Python has another module {module}{f', {imported}' if imported else ''}: rename your module"
         )
 
 

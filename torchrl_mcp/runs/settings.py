@@ -1,4 +1,4 @@
-"""The settings of a configuration by their dotted names."""
+"""Accesses the settings of a configuration by their dotted names."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -7,11 +7,11 @@ from typing import Any
 def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the dotted name and the value of every setting that is not a group of settings.
 
-    A list of groups is a group, in which the settings have their place as name. Any other list is a value.
+    A list of groups is a group, whose items are named by their index. Any other list is a value.
 
     Args:
-        config: A configuration, or a list of them.
-        prefix: Beginning of the names.
+        config: A configuration, or a list of configurations.
+        prefix: Prefix of the names.
 
     >>> list(leaves({"seed": 0, "task": {"near": [1, 2], "mixture": [{"weight": 3}]}}))
     [('seed', 0), ('task.near', [1, 2]), ('task.mixture.0.weight', 3)]
@@ -24,12 +24,12 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def replaced(config: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
-    """Return a configuration with other values of some settings.
+    """Return a configuration with new values of some settings.
 
     Args:
-        config: A configuration, or a list of them.
+        config: A configuration, or a list of configurations.
         values: New values by the dotted names of their settings.
-        prefix: Beginning of the names.
+        prefix: Prefix of the names.
 
     >>> replaced({"seed": 0, "task": {"path": "clips"}}, {"task.path": "walks"})
     {'seed': 0, 'task': {'path': 'walks'}}

@@ -1,6 +1,7 @@
-"""The progress of the runs of a folder.
+"""Shows the progress of the runs in a folder.
 
-It is read from the run folders, so any process on any machine that shares them can show it while a benchmark runs.
+The progress is read from the run folders. Any process, on any machine that shares the folders, can therefore show it
+while a benchmark runs.
 """
 
 import csv
@@ -38,16 +39,19 @@ from torchrl_mcp.training.run_folder import (
 )
 
 MANIFEST = "benchmark-{}.json"
-STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
+"""Name of the file that lists the runs of a benchmark, by the name of the benchmark."""
 
-# Exceptions of reading a damaged file.
+STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
+"""Colours of the states of a run, in the order of the table."""
+
+# Exceptions that reading a damaged file raises.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, csv.Error)
 
 INTERVAL = 1.0
 """Seconds between updates."""
 
 Runs = Mapping[Path, int | None]
-"""Run folders with their total environment steps, None for the total in their configuration."""
+"""Run folders with their total environment steps; None stands for the number in the run's configuration."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +60,12 @@ class Status:
 
     Attributes:
         folder: Run folder.
-        state: ``waiting``, ``running``, ``stopped`` (failed, or killed), ``done`` (with its last checkpoint and its
-            evaluation, if there is one), or ``damaged`` (cannot be read).
+        state: ``waiting``, ``running``, ``stopped`` (failed or killed), ``done`` (has its last checkpoint, and its
+            evaluation unless the run has none), or ``damaged`` (cannot be read).
         frames: Environment steps so far.
         total: Environment steps of the whole run.
         speed: Environment steps per second in the last iteration.
-        normalised_return: Normalised return of the evaluation, else of training's last row; None if neither has one.
+        normalised_return: Normalised return of the evaluation, or else of the last row of the metrics, or None.
     """
 
     folder: Path
@@ -73,13 +77,17 @@ class Status:
 
     @property
     def remaining(self) -> float | None:
-        """Seconds to the end of training, or None if unknown."""
+        """Seconds until the end of training, or None if unknown."""
         return (self.total - self.frames) / self.speed if self.state == "running" and self.speed else None
 
 
 @contextmanager
 def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
-    """Show the progress of ``runs``, or of all in a folder, while the block runs: a table on a terminal, else lines."""
+    """Show the progress of ``runs``, or of all runs in a folder, during the block.
+
+    On a terminal, a table is updated every :data:`INTERVAL` seconds. Elsewhere, a line is printed whenever the state of
+    a run changes.
+    """
     console = Console(file=sys.stdout)
     if console.is_terminal:
         with Live(
@@ -92,7 +100,7 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
             yield
         return
     ended = threading.Event()
-    thread = threading.Thread(target=_tell, args=(folder, runs, ended, sys.stdout), daemon=True)
+    thread = threading.Thread(target=_print_changes, args=(folder, runs, ended, sys.stdout), daemon=True)
     thread.start()
     try:
         yield
@@ -102,7 +110,7 @@ def overview(folder: Path, runs: Runs | None = None) -> Iterator[None]:
 
 
 def look(folder: Path, runs: Runs | None = None) -> list[Status]:
-    """Return the status of ``runs``, or of all runs that are in ``folder`` or planned by benchmarks there."""
+    """Return the status of ``runs``, or of all runs in ``folder``, including runs that its benchmarks plan."""
     damaged: list[Status] = []
     if runs is None:
         configs = sorted(path for path in folder.rglob(CONFIG) if is_run(os.listdir(path.parent)))
@@ -124,22 +132,23 @@ def _status(run: Path, total: int | None) -> Status:
 
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
-    """Write the list of a benchmark's runs and their steps, for other processes to read."""
+    """Write the runs of a benchmark and their environment steps to a file, which other processes read."""
     steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
     write_json(steps, path)
 
 
 def read_manifest(path: Path) -> dict[Path, int]:
-    """Return the runs of a benchmark and the steps of each."""
+    """Return the run folders of a benchmark, with the environment steps of each run."""
     return {(path.parent / run).resolve(): int(total) for run, total in read_json(path).items()}
 
 
 def status(run: Path, total: int | None = None) -> Status:
-    """Return the status of a run of ``total`` environment steps, by default those in its configuration."""
+    """Return the status of a run of ``total`` environment steps, by default the number in its configuration."""
     total = _plan(run)[0] if total is None else total
     last = _last_row(run / METRICS)
     frames = int(last.get("frames", 0))
-    speed, last_return = last.get("time/steps_per_second", 0.0), last.get(NORMALISED_RETURN, math.nan)
+    speed = last.get("time/steps_per_second", 0.0)
+    last_return = last.get(NORMALISED_RETURN, math.nan)
     score = None if math.isnan(last_return) else last_return
     if (run / EVALUATION).exists():
         score = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
@@ -153,7 +162,7 @@ def status(run: Path, total: int | None = None) -> Status:
 
 
 def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -> Table:
-    """Return a table of runs, in the order of :data:`STYLES`, of at most ``height`` rows."""
+    """Return a table of runs with at most ``height`` rows, sorted by state in the order of :data:`STYLES`."""
     order = list(STYLES)
     rows = sorted(statuses, key=lambda one: order.index(one.state))
     shown = rows if height is None or len(rows) <= height else rows[: max(height, 1)]
@@ -168,27 +177,27 @@ def table(statuses: Sequence[Status], folder: Path, height: int | None = None) -
     return result
 
 
-def _tell(folder: Path, runs: Runs | None, ended: threading.Event, terminal: TextIO) -> None:
+def _print_changes(folder: Path, runs: Runs | None, ended: threading.Event, terminal: TextIO) -> None:
     """Print a line whenever a run changes its state; runs in this process replace ``sys.stdout`` by their log."""
-    known: dict[Path, str] = {}
+    states: dict[Path, str] = {}
     last = False
     while not last:
         last = ended.wait(INTERVAL)
         statuses = look(folder, runs)
         for one in statuses:
-            if known.get(one.folder, "waiting") != one.state:
+            if states.get(one.folder, "waiting") != one.state:
                 state, *cells = _cells(one)
                 line = f"{time.strftime('%H:%M:%S')} {state:8} {_name(one.folder, folder)} {' '.join(cells[:3])}"
                 print(f"{line} ({_count(statuses)})", file=terminal, flush=True)
-            known[one.folder] = one.state
+            states[one.folder] = one.state
 
 
 def _cells(one: Status) -> tuple[str, ...]:
     steps = f"{min(one.frames, one.total):,}/{one.total:,}"  # the last batch may exceed the total
     speed = f"{one.speed:,.0f}" if one.state == "running" and one.speed else "-"
     score = "-" if one.normalised_return is None else f"{one.normalised_return:.3f}"
-    left = "-" if one.remaining is None else f"{one.remaining / 60:.0f} min"
-    return one.state, steps, speed, score, left
+    remaining = "-" if one.remaining is None else f"{one.remaining / 60:.0f} min"
+    return one.state, steps, speed, score, remaining
 
 
 def _count(statuses: Sequence[Status]) -> str:
@@ -202,18 +211,18 @@ def _name(run: Path, folder: Path) -> str:
 
 @cache
 def _plan(run: Path) -> tuple[int, int]:
-    """Return the environment steps of a run that has begun, and the episodes of its final evaluation."""
+    """Return the environment steps of a run, and the number of episodes of its final evaluation."""
     config = read_config(run / CONFIG)
     return int(config["training"]["total_frames"]), int(config.get("evaluation", {}).get("episodes", 0))
 
 
 def _is_saved(run: Path, total: int) -> bool:
-    """Return whether a run has its final checkpoint, which is written after the last row."""
+    """Return whether a run has its final checkpoint, which is written after the last row of metrics."""
     return any(run_folder.frames(path) >= total for path in run_folder.find_all(run))
 
 
 def _last_row(path: Path) -> dict[str, float]:
-    """Return the last complete row of a CSV file of numbers, or an empty one."""
+    """Return the last complete row of a CSV file of numbers, or an empty row."""
     if not path.exists():
         return {}
     with path.open("rb") as file:

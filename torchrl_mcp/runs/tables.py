@@ -1,4 +1,4 @@
-"""Text tables of commands and benchmarks."""
+"""Formats tables of commands and benchmarks as text."""
 
 from collections.abc import Mapping, Sequence
 from io import StringIO
@@ -9,15 +9,15 @@ from rich.table import Table
 from rich.text import Text
 
 WIDEST = 10_000
-"""Characters of a line: tables in files and pipes are never folded."""
+"""Characters per line, so many that tables in files and pipes are never folded."""
 
 
 def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) -> str:
-    """Return rows as text with aligned columns, numbers to the right.
+    """Return rows as text with aligned columns, in which numbers are aligned to the right.
 
     Args:
-        rows: Cells by column name, with the same names in every row. Floats get three decimals; an empty text means no
-            value.
+        rows: Cells by column name, with the same names in every row. Floats are printed with three decimals; an empty
+            text stands for a missing value.
         markdown: Draw the lines of a Markdown table.
     """
     table = Table(box=MARKDOWN) if markdown else plain_table()
@@ -30,7 +30,7 @@ def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) 
 
 
 def as_text(table: Table) -> str:
-    """Return a table as text without folds and colours."""
+    """Return a table as text without folded lines and colours."""
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
     with console.capture() as capture:
         console.print(table)
@@ -38,7 +38,7 @@ def as_text(table: Table) -> str:
 
 
 def plain_table(caption: str | None = None) -> Table:
-    """Return an empty table without lines, with a caption below."""
+    """Return an empty table without rules, with a caption below."""
     return Table(caption=caption, caption_justify="left", box=None, padding=(0, 2, 0, 0))
 
 

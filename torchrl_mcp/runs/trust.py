@@ -1,7 +1,7 @@
-"""Reading configurations from files, and checking which classes and functions they may call.
+"""Reads configurations from files, and checks which classes and functions they may call.
 
-A configuration names classes and functions to call. A checkpoint or run folder may come from a stranger, so its
-configuration may only call names in the library's own files and names that the user trusts.
+A configuration names classes and functions that are called. A checkpoint or run folder may come from a stranger.
+Its configuration may therefore name only what the configurations of this library name, and what the user trusts.
 """
 
 import pkgutil
@@ -22,10 +22,10 @@ from torchrl_mcp.runs.settings import leaves
 from torchrl_mcp.training.run_folder import CONFIG
 
 LARGEST = 2**20
-"""Most bytes of a configuration file. A run's has about ten thousand."""
+"""Most bytes of a configuration file. The configuration of a run has about ten thousand bytes."""
 
 DEEPEST = 100
-"""Deepest nesting of brackets in a configuration file. A run's is about five."""
+"""Deepest nesting of brackets in a configuration file. In the configuration of a run, the depth is about five."""
 
 GET_CLASS = "hydra.utils.get_class"
 """Hydra's function that returns a class, for configurations that pass a class as an argument."""
@@ -46,10 +46,10 @@ _trusted: ContextVar[frozenset[str]] = ContextVar("trusted", default=frozenset()
 
 @contextmanager
 def trusting(names: Iterable[str]) -> Iterator[None]:
-    """Trust further names in configurations from files while the block runs.
+    """Trust further names in configurations from files during the block.
 
     Args:
-        names: Modules, for everything that they define, or single classes and functions.
+        names: Names of classes and functions, and names of modules, which stand for everything that they define.
     """
     token = _trusted.set(_trusted.get() | set(names))
     try:
@@ -59,7 +59,7 @@ def trusting(names: Iterable[str]) -> Iterator[None]:
 
 
 def targets(config: Any) -> Iterator[str]:
-    """Yield the names of all classes, functions and modules in a configuration, from the top."""
+    """Yield the names of all classes, functions and modules in a configuration, in their order."""
     settings = list(leaves(config))
     classes = {name.rpartition(".")[0] for name, value in settings if value == GET_CLASS}
     for name, value in settings:
@@ -69,8 +69,8 @@ def targets(config: Any) -> Iterator[str]:
 
 
 @cache
-def known() -> frozenset[str]:
-    """Return the classes and functions that the files of ``conf`` name, without those that they leave to the user."""
+def library_names() -> frozenset[str]:
+    """Return the names of all classes and functions in the files of ``conf``, except names that the user must give."""
     pattern = str(files("torchrl_mcp.conf").joinpath("**/*.yaml"))
     contents = (yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {} for path in glob(pattern, recursive=True))
     settings = ({key: value for key, value in content.items() if key != "hydra"} for content in contents)
@@ -90,16 +90,18 @@ def require_trusted(config: Mapping[str, Any], source: Path) -> None:
     """
     if name := next((name for name in targets(config) if not _may_be_built(name)), None):
         raise ValueError(
-            f"{source} would run {name}, which no configuration of this library names. If you know the file and that "
+            f"{source} would run {name}, which no configuration of this library names. If you trust the file and this "
             f"code, pass --trust {name.rpartition('.')[0] or name}"
         )
     if any("${" in f"{name}{value}" for name, value in leaves(config)):
-        raise ValueError(f"{source} holds an interpolation, which training never writes: it was changed, do not use it")
+        raise ValueError(
+            f"{source} has been changed: it contains an interpolation, which training never writes. Do not use it"
+        )
 
 
 def trust_options(path: Path) -> list[str]:
     """Return the options ``--trust MODULE`` that commands need for the run with a configuration file."""
-    names = [name for name in targets(read_config(path)) if name not in known()]
+    names = [name for name in targets(read_config(path)) if name not in library_names()]
     modules = dict.fromkeys(name.rpartition(".")[0] or name for name in names)
     return [word for module in modules for word in ("--trust", module)]
 
@@ -110,10 +112,10 @@ def resuming(run: Path) -> str:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Return the configuration in a YAML file, with interpolations unresolved.
+    """Return the configuration in a YAML file, with unresolved interpolations.
 
     Raises:
-        ValueError: If the file is no configuration, is too large, refers to parts of itself or is nested too deeply.
+        ValueError: If the file is not a configuration, is too large, contains YAML aliases or is nested too deeply.
         OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
@@ -122,15 +124,15 @@ def read_config(path: Path) -> dict[str, Any]:
     if _depth(text) > DEEPEST:
         raise ValueError(f"{path} is not a configuration: brackets are nested more than {DEEPEST} deep")
     try:
-        # With aliases of aliases, a few lines expand to more than memory holds.
+        # With aliases of aliases, a few lines could expand to more than the memory.
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ValueError(f"{path} refers to parts of itself (YAML aliases), which training never writes")
+            raise ValueError(f"{path} has been changed: it contains YAML aliases, which training never writes")
         config = yaml.load(text, _Loader)
     except (yaml.YAMLError, RecursionError) as error:
         first = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{path} is not a configuration: {first}") from error
     if not isinstance(config, dict):
-        raise ValueError(f"{path} is not a configuration: it holds no settings")
+        raise ValueError(f"{path} is not a configuration: it contains no settings")
     return config
 
 
@@ -142,15 +144,15 @@ def _depth(text: str) -> int:
 def _may_be_built(name: str) -> bool:
     """Return whether a configuration from a file may contain a name. Only trusted modules are imported."""
     trusted = _trusted.get()
-    if name in known() | trusted:
+    if name in library_names() | trusted:
         return True
     if not _is_in(name, trusted):
         return False
     try:
-        # Trust does not extend to names that a trusted module imports from others.
+        # Trust does not extend to names that a trusted module imports from other modules.
         return _is_in(f"{pkgutil.resolve_name(name).__module__}.", trusted)
     except (ImportError, AttributeError, ValueError):
-        return True  # there is nothing to build
+        return True  # a name that does not exist cannot be called
 
 
 def _is_in(name: str, modules: Collection[str]) -> bool:

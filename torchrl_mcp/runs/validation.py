@@ -1,4 +1,4 @@
-"""Checks of the names and the values of settings, once, before anything is written."""
+"""Checks the names and the values of all settings, before a run writes anything."""
 
 import difflib
 import math
@@ -31,7 +31,7 @@ class Rule(NamedTuple):
     allows: Callable[[Any], bool]
 
     def or_null(self) -> "Rule":
-        """Return the rule that allows null as well."""
+        """Return the rule that also allows null."""
         return Rule(f"{self.words}, or null", lambda value: value is None or self.allows(value))
 
 
@@ -53,7 +53,7 @@ def _among(*choices: Any) -> Rule:
 
 
 SEEDS = 2**32
-"""Number of seeds that all generators take."""
+"""Number of seeds that all random generators accept."""
 
 COUNT = Rule("a whole number, at least 1", lambda value: _is_whole(value) and value >= 1)
 WHOLE = Rule("a whole number, at least 0", lambda value: _is_whole(value) and value >= 0)
@@ -141,22 +141,25 @@ NAMES_BY_RULE: dict[Rule, str] = {
 }
 
 RULES = {name: rule for rule, names in NAMES_BY_RULE.items() for name in names.split()}
-"""Rules by the end of a setting's path: settings of one name have one rule, wherever they are."""
+"""Rules by the end of a setting's path. Settings with the same name therefore have the same rule in every group."""
 
 GROUPS = ("task", "stage", "character", "method", "training", "evaluation", "optimizer", "objective", "transfer")
 """Settings that are groups of settings."""
 
 FOLDER = Path(str(files("torchrl_mcp.conf")))
+"""Folder of the library's configuration files."""
 
 COMPARED = ("method", "task", "training", "step_size", "evaluation", "transfer")
-"""Groups whose settings are compared one by one: those that are no arguments of a class."""
+"""Groups whose settings are compared by name, because they are not arguments of a class."""
 
 HEADER = "# @package _global_"
+"""First line of configuration files whose settings are outside the group of the file."""
+
 PARTS = {"transport": "task"}
-"""Files of ``conf`` that others include, and the group of their settings."""
+"""Files of ``conf`` that other files include, and the group of their settings."""
 
 ALIKE = 0.8
-"""Similarity to a known name, from 0 to 1, above which an unknown one is taken for a mistake."""
+"""Similarity to a known name, from 0 to 1, above which an unknown name counts as misspelt."""
 
 
 def require_valid(config: Mapping[str, Any]) -> None:
@@ -166,46 +169,47 @@ def require_valid(config: Mapping[str, Any]) -> None:
         config: The resolved configuration of a run.
 
     Raises:
-        ValueError: If any are wrong, with the name, value and rule of each.
+        ValueError: If values are wrong; the message gives the name, the value and the rule of each.
     """
-    values = [name for name in GROUPS if not isinstance(config.get(name), Mapping)]
-    wrong = [f"{name}={_shown(config.get(name))} must be a group of settings" for name in values]
+    not_groups = [name for name in GROUPS if not isinstance(config.get(name), Mapping)]
+    wrong = [f"{name}={_shown(config.get(name))} must be a group of settings" for name in not_groups]
     wrong += wrong_values(config)
     if not wrong and (schedule := config["optimizer"].get("schedule")):
-        wrong += _step_size_beyond(config["step_size"]["actor"], schedule)
+        wrong += _step_size_out_of_range(config["step_size"]["actor"], schedule)
     if not wrong:
         folders = ((name, str(config[name])) for name in ("run_dir", "run_root"))
         wrong += [
-            f"{name}={path} would be a folder called ~: write {name}={os.path.expanduser(path)}"
+            f"{name}={path} would create a folder called ~: write {name}={os.path.expanduser(path)}"
             for name, path in folders
             if path.startswith("~")
         ]
     if not wrong and _escapes(str(config["run_dir"]), str(config["run_root"])):
-        wrong.append(f"run_dir={config['run_dir']} leaves run_root={config['run_root']}: pass a run_dir")
+        wrong.append(f"run_dir={config['run_dir']} is outside run_root={config['run_root']}: pass another run_dir")
     if wrong:
         raise ValueError("\n".join(wrong))
 
 
 def wrong_values(config: Mapping[str, Any]) -> Iterator[str]:
-    """Say for each setting with a wrong value, or none, what it must be.
+    """Yield an error message for every setting whose value is missing or wrong.
 
     Args:
-        config: Settings, in groups or not.
+        config: Settings, possibly in groups.
     """
     for path, value in leaves(config):
         if value == "???":
-            yield f"{path} is needed: pass {path}=..."
+            yield f"{path} has no value: pass {path}=..."
         elif (rule := _rule(path)) and not rule.allows(value):
             yield f"{path}={_shown(value)} must be {rule.words}"
 
 
-def _step_size_beyond(actor: float, schedule: Mapping[str, Any]) -> Iterator[str]:
-    """Say if the first update would replace the actor's step size, because the schedule does not allow it."""
-    low, high = schedule.get("min_lr", 0.0), schedule.get("max_lr", math.inf)
+def _step_size_out_of_range(actor: float, schedule: Mapping[str, Any]) -> Iterator[str]:
+    """Yield an error message if the schedule would clip the actor's step size in the first update."""
+    low = schedule.get("min_lr", 0.0)
+    high = schedule.get("max_lr", math.inf)
     if not low <= actor <= high:
         yield (
-            f"step_size.actor={actor:g} is beyond what the schedule allows, {low:g} (optimizer.schedule.min_lr) to "
-            f"{high:g} (step_size.max): change one"
+            f"step_size.actor={actor:g} must be from {low:g} (optimizer.schedule.min_lr) to {high:g} (step_size.max), "
+            "the range of the schedule: change one of these settings"
         )
 
 
@@ -215,7 +219,7 @@ def _rule(path: str) -> Rule | None:
 
 
 def _escapes(folder: str, root: str) -> bool:
-    """Return whether a path that begins with ``root`` leaves it, as by ``..``."""
+    """Return whether a path that begins with ``root`` leaves this folder, for example by ``..``."""
     inside = Path(os.path.normpath(folder)).is_relative_to(os.path.normpath(root))
     return folder.startswith(f"{root}/") and not inside
 
@@ -225,18 +229,19 @@ def _shown(value: Any) -> str:
 
 
 def require_used(cfg: DictConfig) -> None:
-    """Check that no setting of a run is a known one misspelt, or in a wrong group.
+    """Check that no setting of a run is misspelt or in a wrong group.
 
-    Other settings that nothing uses are allowed, as labels of runs.
+    Other settings that nothing uses are allowed, because they can label runs.
 
     Args:
-        cfg: The configuration, with its references.
+        cfg: The configuration, with unresolved references.
 
     Raises:
-        ValueError: If one is, with its remedy, or a setting that all runs have is missing.
+        ValueError: If a setting is misspelt or in a wrong group, or a setting that every run needs is missing; the
+            message gives the remedy.
     """
     if missing := [name for name in _content(FOLDER / "train.yaml") if name not in ("defaults", "hydra", *cfg)]:
-        raise ValueError(f"the setting {missing[0]} is missing: leave ~{missing[0]} out")
+        raise ValueError(f"the setting {missing[0]} is missing: remove ~{missing[0]} from the command line")
     config: Any = OmegaConf.to_container(cfg)
     groups = {group: config[group] for group in COMPARED if isinstance(config[group], Mapping)}
     names = [*config, *(f"{group}.{key}" for group, settings in groups.items() for key in settings)]
@@ -250,7 +255,7 @@ def require_used(cfg: DictConfig) -> None:
 
 @cache
 def known_settings() -> frozenset[str]:
-    """Return the settings that the files of ``conf`` have at the top, and those in :data:`COMPARED`."""
+    """Return the top-level settings of the files of ``conf``, and the settings in the groups :data:`COMPARED`."""
     names: set[str] = set()
     for path in FOLDER.rglob("*.yaml"):
         content = _content(path)
@@ -265,11 +270,11 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _remedy(name: str) -> str | None:
-    """Return what to write in place of a setting that nothing uses, None if it resembles no known one."""
+    """Return the remedy for a setting that nothing uses, or None if it is not similar to a known setting."""
     group, _, key = name.rpartition(".")
     if (FOLDER / (group or name)).is_dir() and (not group or key in known_settings()):
-        return f"begin the file of {group or name}= with the line '{HEADER}', or leave {name} out"
+        return f"begin the file of {group or name}= with the line '{HEADER}', or omit {name}"
     if key in known_settings() and group:
         return f"write {key}=..."
-    near = difflib.get_close_matches(name, known_settings(), n=1, cutoff=ALIKE)
-    return f"write {near[0]}" if near else None
+    similar = difflib.get_close_matches(name, known_settings(), n=1, cutoff=ALIKE)
+    return f"write {similar[0]}" if similar else None

@@ -1,1 +1,1 @@
-"""The training loop, its trajectory sources, metrics and checkpoints."""
+"""The training loop, with its trajectory sources, metrics and checkpoints."""

@@ -1,4 +1,4 @@
-"""The progress of training on a terminal."""
+"""Shows the progress of training on standard error."""
 
 import sys
 import time
@@ -9,13 +9,13 @@ from tqdm import tqdm
 from torchrl_mcp.evaluation.bars import bar
 
 QUIET = 60.0
-"""Seconds between lines if there is no terminal."""
+"""Seconds between lines where the output is not a terminal."""
 
 BRIEF = 120.0
-"""Seconds of a training that needs no estimate."""
+"""Trainings that take fewer seconds than this get no estimate."""
 
 FIRST = 2.0
-"""Seconds of batches that an estimate is made of."""
+"""Seconds of collected batches on which the estimate is based."""
 
 
 def duration(seconds: float) -> str:
@@ -28,11 +28,11 @@ def duration(seconds: float) -> str:
 
 
 class TrainingBar:
-    """Steps, speed, time left and a note on a training: a bar on a terminal, else a line every minute.
+    """Shows steps, speed, remaining time and a note: as a bar on a terminal, elsewhere as a line every minute.
 
     Args:
-        total: Environment steps of the training; the last batch may exceed it.
-        done: Steps so far.
+        total: Environment steps of the training; the last batch may exceed this number.
+        done: Environment steps so far.
         shown: Whether to show anything.
         file: Output stream, standard error by default.
     """
@@ -43,7 +43,8 @@ class TrainingBar:
         self._done = done
         self._first = done
         self._shown = shown
-        self._began = self._told = time.monotonic()
+        self._began = time.monotonic()
+        self._last_line = self._began
         self._note = ""
         self._second: tuple[float, int] | None = None  # time and steps at the beginning of the second batch
         self._estimated = not shown
@@ -58,7 +59,7 @@ class TrainingBar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave the bar as it is."""
+        """Close the bar, which stays on the terminal."""
         if self._bar is not None:
             self._bar.close()
 
@@ -67,7 +68,7 @@ class TrainingBar:
 
         Args:
             steps: Environment steps of the batch.
-            note: What has been learned, such as a return; empty to keep showing the last.
+            note: A short result, such as the mean return; if empty, the last note stays.
         """
         self._done += steps
         self._note = note or self._note
@@ -75,12 +76,15 @@ class TrainingBar:
         if self._bar is not None:
             self._bar.set_postfix_str(self._note, refresh=False)
             self._bar.update(min(self._done, self._total) - self._bar.n)
-        elif self._shown and time.monotonic() - self._told >= QUIET:
-            self._told = time.monotonic()
+        elif self._shown and time.monotonic() - self._last_line >= QUIET:
+            self._last_line = time.monotonic()
             print(self._line(), file=self._file, flush=True)
 
     def _estimate(self) -> None:
-        """Say once how long the training will take; the first batch, which prepares what others use, is not counted."""
+        """Print once how long the training will take.
+
+        The first batch does not count, because it also prepares what later batches reuse.
+        """
         if self._estimated:
             return
         now = time.monotonic()
@@ -91,14 +95,17 @@ class TrainingBar:
         if now - began < FIRST or self._done == done:
             return
         self._estimated = True
-        left = self._total - self._done
-        seconds = left * (now - began) / (self._done - done)
+        remaining = self._total - self._done
+        seconds = remaining * (now - began) / (self._done - done)
         if seconds >= BRIEF:
-            line = f"about {duration(seconds)} for {left:,} steps on this machine; shorter: training.total_frames=N"
+            line = (
+                f"about {duration(seconds)} for {remaining:,} steps on this machine; "
+                "for a shorter run, set training.total_frames=N"
+            )
             tqdm.write(line, file=self._file) if self._bar is not None else print(line, file=self._file, flush=True)
 
     def _line(self) -> str:
-        speed = (self._done - self._first) / (self._told - self._began)
-        left = f"{duration(max(self._total - self._done, 0) / speed)} left" if speed else ""
+        speed = (self._done - self._first) / (self._last_line - self._began)
+        remaining = f"{duration(max(self._total - self._done, 0) / speed)} left" if speed else ""
         done = f"{min(self._done, self._total):,} of {self._total:,} steps"
-        return ", ".join(filter(None, [done, f"{speed:,.0f} steps/s", left, self._note]))
+        return ", ".join(filter(None, [done, f"{speed:,.0f} steps/s", remaining, self._note]))

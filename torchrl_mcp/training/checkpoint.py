@@ -1,8 +1,8 @@
 """Checkpoints: one archive per save, written atomically, checked on loading, and free of pickled code.
 
-They are TorchRL's own :class:`torchrl.checkpoint.Checkpoint` archives: a ZIP file with a checksum per tensor and a JSON
-manifest that holds the run's configuration and the library versions. Every part of an agent is a separate
-component, so that transfer can load only the parts that it keeps.
+A checkpoint is an archive of TorchRL's :class:`torchrl.checkpoint.Checkpoint`: a ZIP file with a checksum per tensor,
+and with a JSON manifest that records the run's configuration and the library versions. Every part of an agent is a
+separate component, so that transfer can load the parts that it keeps without the rest.
 """
 
 import errno
@@ -23,7 +23,7 @@ from torchrl_mcp.training.run_folder import CHECKPOINT, CHECKPOINTS, find_all, r
 DAMAGED = ".damaged"
 """Suffix of the name of a checkpoint that could not be restored."""
 
-# Exceptions of torchrl, tensordict, zipfile and json when a file is damaged or of another kind.
+# Exceptions that torchrl, tensordict, zipfile and json raise for a file that is damaged or of another kind.
 UNREADABLE = (
     AttributeError,
     BadZipFile,
@@ -37,14 +37,14 @@ UNREADABLE = (
 )
 
 PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM)
-"""Numbers of errors of the system that say nothing about a file."""
+"""System errors which do not mean that the file is damaged, such as a full disk."""
 
 
 class RunRandomness(GlobalRNGState):
-    """State of the random generators of a run: those of the CPU, and that of its own GPU.
+    """State of a run's random generators: the generators of the CPU, and the generator of the run's GPU.
 
-    TorchRL's class has those of all GPUs, and cannot be restored on a machine with fewer. On a CPU the state of a GPU
-    is left out.
+    TorchRL's class stores the generators of all GPUs, and cannot restore them on a machine with fewer GPUs. For a run
+    on the CPU, no generator of a GPU is stored.
 
     Args:
         device: Device of the run's networks.
@@ -67,7 +67,7 @@ class RunRandomness(GlobalRNGState):
 
 
 def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:
-    """Return the checkpoint of a run: its ``parts``, each under its name, and further ``components`` with state."""
+    """Return the checkpoint of a run: the agent's ``parts`` by name, and further ``components`` with a state."""
     return Checkpoint(format="archive", **{_component(name): part for name, part in parts.items()}, **components)
 
 
@@ -75,13 +75,13 @@ def load(checkpoint: Checkpoint, path: Path) -> None:
     """Restore ``checkpoint`` from the file ``path``.
 
     Raises:
-        ValueError: If the file is missing, truncated, damaged, of another kind, or does not fit.
-        OSError: If the system fails, which says nothing about the file.
+        ValueError: If the file is missing, damaged, of another kind, or written for other networks.
+        OSError: If the system cannot read the file, for example for lack of permission.
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint file {path}")
     level = torchrl_logger.level
-    torchrl_logger.setLevel(ERROR)  # it also warns of another build of a version, as for CUDA
+    torchrl_logger.setLevel(ERROR)  # otherwise TorchRL warns even of another build of the same version, such as +cu128
     try:
         _require_plain_data(path)
         report = checkpoint.load(path, map_location="cpu")
@@ -94,12 +94,12 @@ def load(checkpoint: Checkpoint, path: Path) -> None:
     finally:
         torchrl_logger.setLevel(level)
     versions = report.comparison.get("versions", {})
-    if other := [name for name, pair in versions.items() if _plain(pair["checkpoint"]) != _plain(pair["runtime"])]:
-        torchrl_logger.warning(f"{path} was written with another version of {', '.join(other)}")
+    if changed := [name for name, pair in versions.items() if _plain(pair["checkpoint"]) != _plain(pair["runtime"])]:
+        torchrl_logger.warning(f"{path} was written with another version of {', '.join(changed)}")
 
 
 def load_parts(parts: nn.ModuleDict, names: Collection[str], path: Path) -> None:
-    """Restore the parts ``names`` alone from the checkpoint file ``path``.
+    """Restore only the parts ``names`` from the checkpoint file ``path``.
 
     Raises:
         ValueError: As :func:`load`.
@@ -113,14 +113,14 @@ def load_agent(parts: nn.ModuleDict, path: Path, optional: Collection[str] = ("c
     Args:
         parts: The agent's parts.
         path: The file.
-        optional: Names of parts that the file may lack, besides those that it declares as :func:`shared`.
+        optional: Names of parts that the file may lack, in addition to the parts that it declares as :func:`shared`.
 
     Raises:
         ValueError: As :func:`load`.
     """
     components = _manifest(path)["components"]
-    missing = {*optional, *shared(path)}
-    load_parts(parts, [name for name in parts if name not in missing or _component(name) in components], path)
+    may_be_missing = {*optional, *shared(path)}
+    load_parts(parts, [name for name in parts if name not in may_be_missing or _component(name) in components], path)
 
 
 def rotation(run: Path, keep_last: int) -> CheckpointRotation:
@@ -129,16 +129,16 @@ def rotation(run: Path, keep_last: int) -> CheckpointRotation:
 
 
 def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, config: Mapping[str, Any]) -> None:
-    """Write ``checkpoint`` to the rotation ``checkpoints``. It is on the disk before older ones are removed.
+    """Write ``checkpoint`` to the rotation ``checkpoints``, and only then remove older checkpoints.
 
     Raises:
-        OSError: If it cannot be written, for example because the disk is full.
+        OSError: If the file cannot be written, for example because the disk is full.
     """
     path = checkpoints.directory / CHECKPOINT.format(step)
     try:
         with replacing(path) as partial:
             checkpoint.save(partial, metadata={"config": config})
-    except RuntimeError as error:  # torch's form of what the system refuses
+    except RuntimeError as error:  # torch raises this for errors of the system
         raise OSError(f"cannot write {path}: {error}") from error
     checkpoints.prune()
 
@@ -147,7 +147,7 @@ def find(path: Path) -> Path:
     """Return ``path`` if it is a file, or the newest checkpoint of the run folder ``path``.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no checkpoint.
     """
     if path.is_file():
         return path
@@ -160,7 +160,7 @@ def is_intact(path: Path) -> bool:
     """Return whether the file ``path`` is a complete checkpoint, with a manifest and correct checksums.
 
     Raises:
-        OSError: If the system fails, which says nothing about the file.
+        OSError: If the system cannot read the file, for example for lack of permission.
     """
     try:
         _manifest(path)
@@ -172,7 +172,7 @@ def is_intact(path: Path) -> bool:
 
 
 def _raise_passing(error: BaseException) -> None:
-    """Raise an error that says nothing about a file, instead of judging the file by it."""
+    """Raise ``error`` if its cause is the system and not the file."""
     if isinstance(error, OSError) and error.errno in PASSING:
         raise error
 
@@ -192,7 +192,7 @@ def saved_config(path: Path) -> Mapping[str, Any]:
 
 
 def shared(path: Path) -> Mapping[str, str]:
-    """Return the fingerprints, by name, of the parts that the checkpoint file ``path`` leaves to other networks.
+    """Return fingerprints, by name, of the parts that ``path`` does not store because other networks share them.
 
     Raises:
         ValueError: If the file is not a checkpoint of this library.
@@ -213,24 +213,24 @@ def _manifest(path: Path) -> Mapping[str, Any]:
             f"{path} is damaged, or is not a checkpoint of torchrl-mcp: {error}. Give another file, such as an older "
             "checkpoint of the run"
         ) from error
-    raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: it holds no configuration")
+    raise ValueError(f"{path} is not a checkpoint of torchrl-mcp: its manifest has no configuration")
 
 
 def _require_plain_data(path: Path) -> None:
-    """Refuse an archive with compressed files, or with other files than JSON and tensors.
+    """Refuse an archive that contains compressed files, or files other than JSON and tensors.
 
-    Tensordict would unpickle some other files, which can run any code, and compressed files could fill a disk.
+    Tensordict would unpickle some other kinds of files, which can run any code. Compressed files could fill a disk.
     """
     with ZipFile(path) as archive:
         for name in archive.namelist():
             if not name.endswith((".json", ".memmap")):
-                raise CheckpointError(f"it holds {name}, which is neither JSON nor a tensor")
+                raise CheckpointError(f"the archive contains {name}, which is neither JSON nor a tensor")
         if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
-            raise CheckpointError("it would unpack to more than its own size, which no checkpoint of torchrl-mcp does")
+            raise CheckpointError("the archive is compressed, which no checkpoint of torchrl-mcp is")
 
 
 def _plain(version: str) -> str:
-    """Return a version without its build, such as ``+cpu``."""
+    """Return a version without the name of its build, such as ``+cpu``."""
     return version.partition("+")[0]
 
 

@@ -1,4 +1,4 @@
-"""Trajectory sources: environments in this process, or in workers on one machine or many."""
+"""Trajectory sources: environments in this process, or in workers on one or several machines."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
@@ -22,7 +22,7 @@ from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
 
 PATIENCE = 5.0
-"""Seconds after which workers that have not ended are killed."""
+"""Seconds that workers have to end before they are killed."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Batches:
     """How trajectories are collected.
 
     Args:
-        frames: Steps ``N * T`` of a batch.
+        frames: Environment steps per batch, ``N * T``.
         device: Device of the policy and of the trajectories.
         autocast: Whether the policy computes in bfloat16.
-        stopwatch: What measures the time.
+        stopwatch: Receives the time of each section, in seconds.
     """
 
     frames: int
@@ -46,9 +46,9 @@ class TrajectorySource(Protocol):
     """The interface of trajectory sources.
 
     Attributes:
-        env: Environments of the same kind as the stepped ones, of any number.
-        num_envs: Number of stepped environments, ``N``.
-        resumes_episodes: Whether a resumed run continues its episodes, or begins new ones.
+        env: Environments of the same kind as the environments that collect, in any number.
+        num_envs: Number of environments that collect, ``N``.
+        resumes_episodes: Whether a resumed run continues its episodes; otherwise it begins new ones.
     """
 
     env: Environments
@@ -83,8 +83,8 @@ class TrajectorySource(Protocol):
 class LocalSource:
     """A trajectory source of environments in this process.
 
-    Its state is the environments' state. If that includes their episodes, a resumed run continues these to the same
-    numbers.
+    The state of the source is the state of its environments. If that includes their episodes, a resumed run continues
+    these episodes and gives the same numbers.
 
     Args:
         env: Environments, batch size ``[N]``, with or without transforms.
@@ -121,7 +121,7 @@ class LocalSource:
         """Return the next trajectories; the time goes to ``physics`` and ``forward``."""
         before = self.env.physics_seconds
         # OpenMP's threads spin for milliseconds after each parallel operation, often longer than a control step takes.
-        # So torch uses this thread alone, and leaves the other processors to physics.
+        # Torch therefore uses this thread only, and leaves the other cores to physics.
         with self._precision(), threads(1):
             batch = next(self._batches)
         self._stopwatch.add("physics", self.env.physics_seconds - before)
@@ -143,10 +143,10 @@ class LocalSource:
         """Restore the state of the environments.
 
         Raises:
-            ValueError: If the state is of workers.
+            ValueError: If the state was written by a :class:`RemoteSource`.
         """
         if "starts" in state:
-            raise ValueError("it was written with collector=processes or ray: resume with the same collector")
+            raise ValueError("the run used collector=processes or ray: resume with the same collector")
         self.env.load_state_dict(state)
 
 
@@ -156,22 +156,23 @@ def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) ->
 
 
 class RemoteSource:
-    """A trajectory source of workers, which a TorchRL backend starts and which act with the newest weights.
+    """A trajectory source of worker processes, which act with the newest weights.
 
-    A resumed run begins new episodes, with other seeds than the first ones.
+    A backend of TorchRL starts the workers. A resumed run begins new episodes, with other seeds than before.
 
     Args:
-        make_env: Makes the environments of a worker as ``make_env(num_envs=, seed=, num_threads=)``; picklable.
-        num_envs: Total number of environments of all workers, ``N``.
+        make_env: Picklable function that makes the environments of one worker, called as
+            ``make_env(num_envs=, seed=, num_threads=)``.
+        num_envs: Number of environments of all workers together, ``N``.
         seed: Seed of environments and exploration, from which the workers' seeds are derived.
         num_workers: Number of workers.
-        num_threads: Number of threads of each worker's physics.
+        num_threads: Number of physics threads per worker.
         backend: Backend of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``,
             ``rpc`` or ``submitit``.
         backend_options: Options of the backend.
 
     Raises:
-        ValueError: If the environments do not divide evenly, or Ray is not installed.
+        ValueError: If ``num_envs`` is not a multiple of ``num_workers``, or Ray is not installed.
     """
 
     resumes_episodes = False
@@ -220,23 +221,23 @@ class RemoteSource:
             storing_device=batches.device,
             **self._backend,
         )
-        # TorchRL leaves the main process one of torch's threads less for every worker, but workers rest during updates.
+        # TorchRL takes one of torch's threads from the main process for every worker, but workers idle during updates.
         with threads_kept(), new_workers() as self._workers:
             self._collector = self._begin(make_collector)
         GlobalRNGState().load_state_dict(random)
         self._batches: Iterator[TensorDictBase] | None = None
 
     def collect(self) -> TensorDictBase:
-        """Return the next trajectories, from the newest weights; the time goes to ``collection``.
+        """Return the next trajectories, collected with the newest weights; the time goes to ``collection``.
 
         Raises:
-            ChildProcessError: If a worker on this machine has ended.
+            ChildProcessError: If a worker on this machine or of Ray has ended.
         """
         with self._stopwatch("collection"):
             return attend(self._next, self._workers).reshape(self.num_envs, self._steps).to(self._device)
 
     def metrics(self) -> dict[str, float]:
-        """Return no metrics, not even ``episode/diverged``: the environments are in the workers."""
+        """Return no metrics: ``episode/diverged`` is unknown, because the environments are in the workers."""
         return {}
 
     def stop(self) -> None:
@@ -248,17 +249,17 @@ class RemoteSource:
             end(self._workers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of starts of the workers."""
+        """Return how often the workers have been started."""
         return {"starts": self._starts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the number of starts, so that the workers begin with new seeds.
 
         Raises:
-            ValueError: If the state is of environments in this process.
+            ValueError: If the state was written by a :class:`LocalSource`.
         """
         if "starts" not in state:
-            raise ValueError("it was written with collector=local: resume with the same collector")
+            raise ValueError("the run used collector=local: resume with the same collector")
         self._starts = state["starts"]
 
     def _begin(self, make_collector: Callable[..., Collector]) -> Collector:
@@ -298,12 +299,12 @@ def _begin_processes(make_collector: Callable[..., Collector]) -> Collector:
     try:
         return begun(partial(make_collector, weight_sync_schemes={"policy": weights}))
     except BaseException:
-        weights.shutdown()  # at the interpreter's exit it would wait for ever for a thread that cannot start
+        weights.shutdown()  # otherwise the interpreter's exit would wait forever for a thread that cannot start
         raise
 
 
 def _begin_worker(make_env: Callable[..., Environments], *, seed: int, **settings: int) -> Environments:
-    """Return a worker's environments, called in its process; seed its exploration and tie its life to the parent."""
+    """Return the environments of a worker, in its process, which is seeded here and ends with its parent."""
     end_with_parent()
     torch.manual_seed(seed)
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Dead units: hidden units that no sample of a batch activates, so that the batch changes nothing about them."""
+"""Dead units: hidden units that no sample of a batch activates, so that they get no gradient."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 MIN_SAMPLES = 64
-"""Least number of samples to judge units by: an option that rarely acts sees fewer."""
+"""Least number of samples from which units are judged. An option that rarely acts may see fewer."""
 
 
 class DeadUnits:

@@ -1,4 +1,4 @@
-"""Returns and lengths of the episodes that end during training."""
+"""Measures returns and lengths of the episodes that end during training."""
 
 import math
 from typing import Any
@@ -17,8 +17,8 @@ class EpisodeStatistics:
         num_envs: Number of environments, ``N``.
 
     Attributes:
-        steps: Steps so far in each environment. While there are fewer than an episode may have, only episodes that
-            end early have ended: the mean of their returns is not that of all.
+        steps: Steps so far in each environment. While this number is below the longest episode, only episodes that end
+            early have ended, and the mean of their returns differs from the mean of all episodes.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -42,11 +42,11 @@ class EpisodeStatistics:
         return torch.cat(ended_returns), torch.cat(ended_lengths)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the steps, and the sums of the unfinished episodes."""
+        """Return the steps, and returns and lengths so far of the unfinished episodes, ``(N,)``."""
         return {"steps": self.steps, "returns": self.returns, "lengths": self.lengths}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`state_dict`; older ones lack the steps."""
+        """Restore the result of :meth:`state_dict`; the states of older versions lack the steps."""
         self.steps = state.get("steps", math.inf)
         self.returns = state["returns"].clone()
         self.lengths = state["lengths"].clone()

@@ -10,9 +10,10 @@ from torch import Tensor
 def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: float, **kwargs: Any) -> torch.optim.Adam:
     r"""Return Adam whose step size for the weights of a layer with :math:`n` inputs is :math:`\alpha \min(1, m / n)`.
 
-    Adam moves every weight by about its step size, however small the gradient. The inputs of a layer after rectifiers
-    are not negative, so that one step can move a unit's sum by the step size times the sum of all inputs. At first the
-    steps of many minibatches agree, and a few of them make the unit zero for all samples: it is dead.
+    Adam moves every weight by about the step size, however small the gradient. The inputs of a layer after rectifiers
+    are not negative. One step can therefore move the sum of a unit by the step size times the sum of all inputs. Early
+    in training the steps of many minibatches agree: a few of them can make the unit zero for all samples, which means
+    that it is dead.
 
     Args:
         parameters: Parameters of linear layers: weights ``(outputs, n)`` and biases ``(outputs,)``.

@@ -1,4 +1,4 @@
-"""The metrics of a run: one CSV file, and any of TorchRL's loggers."""
+"""Writes the metrics of a run to a CSV file, and to any of TorchRL's loggers."""
 
 import csv
 import math
@@ -14,8 +14,8 @@ from torchrl_mcp.training.run_folder import CSV_LOGGER, METRICS, flush, replacin
 def begin_after(logger: Logger, frames: int) -> None:
     """Make TensorBoard drop the values that a killed run logged after environment step ``frames``.
 
-    Other loggers need no change: the csv logger's files are rewound with ``metrics.csv``, W&B ignores steps that it has
-    already, and MLflow treats a resumed run as a new one.
+    Other loggers need no change: the files of the csv logger are rewound with ``metrics.csv``, W&B ignores steps that
+    it has already received, and MLflow treats a resumed run as a new run.
     """
     if isinstance(logger, TensorboardLogger):
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -38,7 +38,7 @@ class MetricsWriter:
         self._columns: list[str] = []
 
     def write(self, metrics: Mapping[str, float], *, step: int) -> None:
-        """Append ``metrics`` at environment step ``step``; those that are new get a column, NaN in the rows so far.
+        """Append ``metrics`` at environment step ``step``. New metrics get a column, which is NaN in earlier rows.
 
         Raises:
             FileNotFoundError: If the file was removed since the last row.
@@ -50,7 +50,7 @@ class MetricsWriter:
         with self.path.open("a", newline="") as file:
             csv.DictWriter(file, self._columns, restval=math.nan).writerow(dict(metrics))
         for logger in self.loggers:
-            logger.log_metrics({k: v for k, v in metrics.items() if v == v}, step=step)
+            logger.log_metrics({k: v for k, v in metrics.items() if not math.isnan(v)}, step=step)
 
     def flush(self) -> None:
         """Flush the file to the disk.
@@ -62,7 +62,7 @@ class MetricsWriter:
             flush(self.path)
 
     def rewind(self, iteration: int) -> None:
-        """Drop the rows after ``iteration``, written by a run that was killed before its next checkpoint.
+        """Drop the rows after ``iteration``, which a run wrote that was killed before its next checkpoint.
 
         Raises:
             ValueError: If the rows end before ``iteration``.
@@ -70,17 +70,17 @@ class MetricsWriter:
         kept = [row for row in self._rows() if int(row["iteration"]) <= iteration]
         if (last := int(kept[-1]["iteration"]) if kept else 0) < iteration:
             raise ValueError(
-                f"{self.path} ends after {last} iterations, the checkpoint is of iteration {iteration}: put the file "
-                "back from a copy, or train anew in another folder"
+                f"{self.path} ends after iteration {last}, but the checkpoint is of iteration {iteration}: restore the "
+                "file from a copy, or start a new run in another folder"
             )
         if not self.path.exists():
             return
-        # Without rows, even the header may be incomplete: the next row writes it again.
+        # A file without rows may have an incomplete header: the next row writes the header again.
         self._rewrite(kept)
         self._rewind_csv_logger(int(kept[-1]["frames"]) if kept else 0)
 
     def _rewrite(self, rows: Sequence[Mapping[str, str]], names: Iterable[str] = ()) -> None:
-        """Replace the file by ``rows`` with columns for ``names`` as well, NaN where a row has none."""
+        """Replace the file by ``rows``, with further columns for ``names``; missing values become NaN."""
         self._columns = list(dict.fromkeys([*(rows[0] if rows else ()), *names]))
         with replacing(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns, restval=math.nan)
@@ -97,7 +97,7 @@ class MetricsWriter:
                 partial.write_text("".join(line for line in pairs if int(line.partition(",")[0]) <= frames))
 
     def _rows(self) -> list[dict[str, str]]:
-        """Return all complete rows with a number of iteration."""
+        """Return all complete rows that have an iteration."""
         if not self.path.exists():
             return []
         with self.path.open(newline="", errors="replace") as file:

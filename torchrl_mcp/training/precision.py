@@ -1,6 +1,6 @@
-"""The precision of networks, bfloat16 or float32: whichever is faster on the machine.
+"""Chooses the precision of networks, bfloat16 or float32, by which is faster on the machine.
 
-``autocast=auto`` chooses once, when a run begins, and the run keeps the choice. It depends on the device:
+``autocast=auto`` chooses when a run begins, and the run keeps the choice. The choice depends on the device:
 
 =================================================  ==================================================
 device                                             choice
@@ -11,8 +11,8 @@ CUDA or ROCm device                                bfloat16 from compute capabil
 any other                                          the faster one for a timed matrix product
 =================================================  ==================================================
 
-This includes x86 processors with AVX512-BF16 alone, some of which compute bfloat16 at twice the rate of float32 and
-others at half of it, and Arm processors, where the speed depends on the build of torch.
+The last row includes x86 processors that have AVX512-BF16 but no AMX, some of which compute bfloat16 at twice the rate
+of float32 and others at half the rate. It also includes Arm processors, where the speed depends on the build of torch.
 """
 
 import time
@@ -24,7 +24,8 @@ import torch
 from torchrl_mcp.training.threads import threads
 
 ADVANTAGE = 0.8
-"""Largest time of a product in bfloat16, relative to float32, at which bfloat16 is chosen."""
+"""Bfloat16 is chosen if a product takes at most this share of the time in float32."""
+
 SHAPE = (256, 1024, 1024)
 """Rows, inputs and outputs of the timed product: a small batch in a wide layer."""
 REPEATS = 10
@@ -53,14 +54,14 @@ def name(autocast: bool) -> str:
 
 
 def choose(autocast: bool | str, device: torch.device | str) -> Precision:
-    """Return the precision of networks on a device, and warn if bfloat16 is asked for and slower.
+    """Return the precision of networks on a device, and warn if ``autocast=True`` is slower than float32.
 
     Args:
         autocast: True for bfloat16, False for float32, or ``auto`` for the faster.
         device: Device of the networks.
 
     Raises:
-        ValueError: If ``autocast`` is anything else.
+        ValueError: If ``autocast`` is neither a Boolean nor ``auto``.
     """
     if autocast != "auto" and not isinstance(autocast, bool):
         raise ValueError(f"autocast={autocast!r} must be auto, true or false")
@@ -98,7 +99,7 @@ def is_native(device: torch.device | str) -> bool | None:
 
 
 def relative_time(device: torch.device | str) -> float:
-    """Return the time of a matrix product in bfloat16 relative to float32, on a CPU with one thread."""
+    """Return the time of a matrix product in bfloat16, as a multiple of the time in float32; a CPU uses one thread."""
     rows, inputs, outputs = SHAPE
     operands = torch.ones(rows, inputs, device=device), torch.ones(outputs, inputs, device=device)
     products = [[x.to(dtype) for x in operands] for dtype in (torch.bfloat16, torch.float32)]
@@ -110,7 +111,8 @@ def relative_time(device: torch.device | str) -> float:
 
 def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
     """Return the time of ``rows @ weight.T`` in seconds."""
-    clock = time.thread_time if rows.device.type == "cpu" else time.perf_counter  # without what other processes cost
+    # A thread's own time does not depend on other processes.
+    clock = time.thread_time if rows.device.type == "cpu" else time.perf_counter
     _wait(rows.device)
     start = clock()
     torch.nn.functional.linear(rows, weight)

@@ -1,4 +1,4 @@
-"""The progress of a run, and a stopwatch for its sections."""
+"""Counts the steps of a run, and measures the time of its sections."""
 
 import time
 from collections.abc import Iterator
@@ -11,7 +11,13 @@ from torch import nn
 
 @dataclass
 class Progress:
-    """The progress of a run; part of its checkpoints."""
+    """The progress of a run, which every checkpoint stores.
+
+    Attributes:
+        iteration: Iterations so far.
+        frames: Environment steps so far.
+        seconds: Wall-clock seconds of all iterations.
+    """
 
     iteration: int = 0
     frames: int = 0
@@ -28,13 +34,13 @@ class Progress:
 
 @dataclass
 class Stopwatch:
-    """Wall-clock seconds by section. Time outside all sections is overhead."""
+    """Measures wall-clock seconds by section. The time outside all sections is overhead."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def __call__(self, section: str) -> Iterator[None]:
-        """Time a block."""
+        """Add the time of a block to a section."""
         start = time.perf_counter()
         yield
         self.add(section, time.perf_counter() - start)
@@ -44,7 +50,7 @@ class Stopwatch:
         self.seconds[section] = self.seconds.get(section, 0.0) + seconds
 
     def watch(self, section: str, module: nn.Module) -> None:
-        """Time every forward pass of ``module``."""
+        """Add the time of every forward pass of ``module`` to a section."""
         starts: list[float] = []
         module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
         module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))

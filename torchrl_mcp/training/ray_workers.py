@@ -1,4 +1,4 @@
-"""Ray's workers: collectors in Ray's processes, and the reason when one of them fails."""
+"""Collectors in processes of Ray, with errors that give the reason why a worker failed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,25 +13,28 @@ class RayWorker(Collector):
     """TorchRL's collector in a process of Ray."""
 
     def __bool__(self) -> bool:
-        """Return True: Ray asks for it where the constructor failed, and TorchRL would count the remaining batches."""
+        """Return True, so that Ray can test a worker whose constructor failed.
+
+        By default, Python would call TorchRL's ``__len__``, which counts the remaining batches.
+        """
         return True
 
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """If the block, which makes a collector of Ray's workers, fails, end them and say why.
+    """End Ray's workers if the block, which starts them, fails, and raise an error that gives the reason.
 
     Raises:
-        ChildProcessError: If a worker ends, or fails with another error than those below.
-        OSError: Of the block.
-        ValueError: Likewise.
+        ChildProcessError: If a worker ends, or fails with an error other than the two below.
+        OSError: If the block raises this error.
+        ValueError: If the block raises this error.
     """
     from ray.exceptions import RayError
 
     try:
         yield
     except Exception as error:
-        # The collector ends its workers, and Ray if it started Ray, as soon as no frame refers to it.
+        # As soon as no frame refers to the collector, it ends its workers, and Ray itself if the collector started it.
         clear_frames(error.__traceback__)
         if isinstance(error, RayError):
             raise _reason("started", error) from error
@@ -42,7 +45,7 @@ def starting() -> Iterator[None]:
 
 @contextmanager
 def working() -> Iterator[None]:
-    """Say why a worker fails or ends in the block.
+    """Raise an error that gives the reason if a worker fails or ends during the block.
 
     Raises:
         ChildProcessError: If a worker fails or ends.
@@ -61,6 +64,6 @@ def _reason(doing: str, error: Exception) -> ChildProcessError:
     if isinstance(error, RayTaskError) or getattr(error, "actor_init_failed", False):
         return failure(f"a worker of Ray failed while it {doing}", error)
     return ChildProcessError(
-        f"a worker of Ray has ended while it {doing}. Ray's logs may say why; often memory ran out: try fewer "
-        "collector.num_workers or training.num_envs"
+        f"a worker of Ray has ended while it {doing}. Ray's logs may give the reason, which is often a lack of memory: "
+        "reduce collector.num_workers or training.num_envs"
     )

@@ -1,4 +1,4 @@
-"""The files of a run folder: their names, and how they are written."""
+"""The files of a run folder: their names, and functions that read and write them."""
 
 import csv
 import json
@@ -13,53 +13,56 @@ from pathlib import Path
 from typing import Any
 
 CONFIG = "config.yaml"
-"""Every setting of the run. A folder holds a run if it has this file."""
+"""All settings of the run."""
 
 METRICS = "metrics.csv"
-"""A row of metrics per iteration."""
+"""One row of metrics per iteration."""
 
 NORMALISED_RETURN = "episode/normalised_return"
-"""The column of metrics with the mean of the episodes that ended; ``nan`` if none did, or none can be whole yet."""
+"""The column with the mean of the ended episodes: ``nan`` if none ended, or if none can have its full length yet."""
 
 EVALUATION = "evaluation.json"
 """The evaluation of the final policy."""
 
 MODES = ("deterministic", "stochastic")
-"""How the policy chooses its actions in an evaluation; the names of its parts."""
+"""How the policy chooses its actions in an evaluation; the keys of ``evaluation.json``."""
 
 PROVENANCE = "origin.json"
 """The run's provenance: command, commit, versions and machine."""
 
 LOG = "train.log"
-"""The output of a run of a benchmark."""
+"""The output of a run that is part of a benchmark."""
 
 WANDB = "wandb-id"
-"""The identifier of the run at W&B, by which a resumed run goes on there."""
+"""The identifier of the run at W&B, with which a resumed run continues to log."""
 
 CHECKPOINTS = "checkpoints"
 """The folder of checkpoints."""
 
 CHECKPOINT = "checkpoint-{:012d}.torchrl"
-"""Name of a checkpoint file by environment steps, in the form of TorchRL's rotation."""
+"""Name of a checkpoint file, with the number of environment steps, as TorchRL's rotation expects it."""
 
 PARTIAL = ".partial"
 """Suffix of the name of a file that is being written."""
 
 CSV_LOGGER = "csv/scalars"
-"""The folder of the files of TorchRL's csv logger, with lines ``step,value``."""
+"""The folder in which TorchRL's csv logger writes its files, with lines ``step,value``."""
 
 UNPACKED = "torchrl-checkpoint-load-*"
-"""Folders into which TorchRL unpacks checkpoints to read them, in the system's folder for temporary files."""
+"""Folders for temporary files into which TorchRL unpacks the checkpoints that it reads."""
 
 LARGEST = 2**24
-"""Most bytes of a JSON file. A run's has a few thousand."""
+"""Most bytes of a JSON file that is read. The JSON files of a run have a few thousand bytes."""
 
 STALE = 3600.0
-"""Seconds after which no process can still be reading a checkpoint."""
+"""Seconds after which a folder with an unpacked checkpoint is no longer in use."""
 
 
 def is_run(names: Collection[str]) -> bool:
-    """Return whether a folder with entries of these names holds a run; a ``config.yaml`` may be another program's."""
+    """Return whether a folder with entries ``names`` contains a run; ``config.yaml`` alone is not enough.
+
+    Other programs also write files with this name.
+    """
     return METRICS in names or (CONFIG in names and not {CHECKPOINTS, EVALUATION, PROVENANCE}.isdisjoint(names))
 
 
@@ -67,8 +70,8 @@ def is_run(names: Collection[str]) -> bool:
 def replacing(path: Path) -> Iterator[Path]:
     """Replace a file atomically: the block writes to a temporary path, which then becomes ``path``.
 
-    Readers find either the old content or the new, also after a crash or a power failure: content and folder are
-    flushed to the disk. If the block fails, the old file stays. Missing folders are created.
+    Readers see either the old content or the new content, even after a crash or a power failure, because the file and
+    its folder are flushed to the disk. If the block fails, the old file stays. Missing folders are created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}{PARTIAL}")
@@ -91,22 +94,22 @@ def read_json(path: Path) -> dict[str, Any]:
     """Return the content of a JSON file.
 
     Raises:
-        ValueError: If it is damaged, too large or nested too deeply, or holds no object.
+        ValueError: If the file is damaged, too large or nested too deeply, or is not a JSON object.
         OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
-        raise ValueError(f"it has more than {LARGEST} bytes")
+        raise ValueError(f"the file has more than {LARGEST} bytes")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
+        raise ValueError("the JSON is nested too deeply") from error
     if not isinstance(content, dict):
-        raise ValueError("it holds no object")
+        raise ValueError("the JSON is not an object")
     return content
 
 
 def read_metrics(run: Path) -> list[dict[str, float]]:
-    """Return the rows of a run's ``metrics.csv``; blanks become NaN, and an incomplete last row is left out.
+    """Return the rows of a run's ``metrics.csv``, without an incomplete last row; empty fields become NaN.
 
     Raises:
         ValueError: If a row is damaged.
@@ -119,30 +122,31 @@ def read_metrics(run: Path) -> list[dict[str, float]]:
         try:
             return [{name: float(value or "nan") for name, value in row.items()} for row in rows]
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}:{rows.line_num} is damaged: {error}; correct or remove the line") from error
+            raise ValueError(f"{path}:{rows.line_num} is damaged: {error}. Correct or remove the line") from error
 
 
 def find_all(run: Path) -> list[Path]:
     """Return the checkpoint files that training wrote to a run folder, newest first."""
-    # By name alone: TorchRL's rotation skips unreadable files, and an older checkpoint would be a surprise.
+    # The name decides: TorchRL's rotation skips unreadable files, so that a run would silently load an older one.
     return sorted(
         (path for path in (run / CHECKPOINTS).glob("checkpoint-*.torchrl") if frames(path) >= 0), reverse=True
     )
 
 
 def frames(path: Path) -> int:
-    """Return the environment steps in the name of a checkpoint file, -1 if there are none.
+    """Return the environment steps in the name of a checkpoint file, or -1 if the name contains none.
 
-    A copy such as ``checkpoint-best.torchrl`` has none.
+    A copy such as ``checkpoint-best.torchrl`` is an example of such a name.
     """
     step = path.stem.removeprefix("checkpoint-")
     return int(step) if step.isdecimal() else -1
 
 
 def remove_leftovers(run: Path) -> None:
-    """Remove unfinished files of killed processes, and checkpoints that they unpacked.
+    """Remove unfinished files of killed processes, and checkpoints that these processes unpacked.
 
-    No other process may be working on the run. Other files stay: the folder may be the user's, or hold other runs.
+    The caller ensures that no other process works on the run. All other files stay, because the folder may belong to
+    the user or contain other runs.
     """
     unfinished = [
         *(path for name in (CONFIG, METRICS, EVALUATION, PROVENANCE) for path in run.glob(f"{name}{PARTIAL}")),
@@ -159,7 +163,7 @@ def remove_leftovers(run: Path) -> None:
 
 
 def _age(path: Path) -> float:
-    """Return the seconds since a file was changed, 0 if it no longer exists."""
+    """Return the seconds since a file was changed, or 0 if the file no longer exists."""
     try:
         return time.time() - path.stat().st_mtime
     except FileNotFoundError:
@@ -169,8 +173,8 @@ def _age(path: Path) -> float:
 def flush(path: Path) -> None:
     """Flush a file, or the entries of a folder, to the disk."""
     if path.is_dir() and sys.platform == "win32":
-        return  # Windows cannot flush folders, and files only if they are open for writing
-    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+        return  # Windows cannot flush folders
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows flushes only writable files
     try:
         os.fsync(descriptor)
     finally:

@@ -1,4 +1,4 @@
-"""Control of torch's threads."""
+"""Controls how many threads torch uses."""
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 @contextmanager
 def threads(number: int) -> Iterator[None]:
-    """Let torch use ``number`` threads on the CPU while the block runs, and then as many as before."""
+    """Let torch use ``number`` threads on the CPU during the block; afterwards restore the number."""
     before = torch.get_num_threads()
     torch.set_num_threads(number)
     try:
@@ -23,19 +23,19 @@ def threads(number: int) -> Iterator[None]:
 
 @contextmanager
 def threads_kept() -> Iterator[None]:
-    """Let torch have as many threads after the block as before it, whatever the block sets."""
+    """Restore the number of torch's threads after a block that may change the number."""
     with threads(torch.get_num_threads()):
         yield
 
 
 def side_by_side(tasks: Mapping[str, Callable[[], Result]]) -> dict[str, Result]:
-    """Run tasks in parallel, each with its share of torch's threads, or in turn if there are too few threads.
+    """Run tasks in parallel, each with an equal share of torch's threads; with too few threads, run them in turn.
 
-    One thread for each of two networks is faster than two threads for every matrix product: the networks do not wait
-    for each other at each operation, and Python's work for one overlaps with the products of the other.
+    Two networks with one thread each are faster than two threads for every matrix product: the threads do not wait for
+    each other after each operation, and Python's work for one network overlaps with the products of the other.
 
     Args:
-        tasks: Functions by name. They draw no random numbers and change no shared data.
+        tasks: Functions by name. The functions must not draw random numbers or change shared data.
 
     Returns:
         The result of each task, by name.

@@ -1,4 +1,4 @@
-"""The training loop: collect, learn, record. One loop for every method."""
+"""The training loop, which is the same for every method: collect, learn, record."""
 
 import time
 from pathlib import Path
@@ -21,12 +21,12 @@ from torchrl_mcp.training.update import Agent, Objective, PPOSettings, Update
 
 
 class RunFolder:
-    """What a training writes: metrics, and checkpoints with the configuration.
+    """Receives the output of a training: metrics, and checkpoints with the configuration.
 
     Args:
         path: The run folder.
-        config: The run's configuration, JSON-compatible, kept in every checkpoint.
-        keep_checkpoints: Number of checkpoints to keep, of which the newest stay.
+        config: The run's configuration, JSON-compatible, which every checkpoint stores.
+        keep_checkpoints: Number of the newest checkpoints to keep.
     """
 
     def __init__(self, path: Path, config: dict[str, Any], *, keep_checkpoints: int) -> None:
@@ -36,15 +36,15 @@ class RunFolder:
 
 
 class Trainer:
-    """Policy optimisation of an agent.
+    """Optimises the policy of an agent.
 
     Args:
-        source: Source of trajectories of ``N`` environments.
+        source: Collects trajectories of ``N`` environments.
         agent: The networks.
-        objective: What is optimised, and how.
-        settings: The numbers of the training.
-        folder: What is written.
-        progress_bar: Show the progress on standard error.
+        objective: Advantages, losses and optimisers.
+        settings: Numbers of steps, batches and passes.
+        folder: Receives metrics and checkpoints.
+        progress_bar: Whether to show the progress on standard error.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Trainer:
         )
 
     def run(self) -> None:
-        """Train until ``total_frames``, with checkpoints."""
+        """Train until ``total_frames``, and save checkpoints."""
         settings = self.settings
         batches = Batches(settings.frames_per_batch, self.agent.device, settings.autocast, self.stopwatch)
         self.source.start(self._behaviour(), batches)
@@ -91,7 +91,11 @@ class Trainer:
             self.source.stop()
 
     def iterate(self) -> dict[str, float]:
-        """Collect a batch, learn from it, and write and return its metrics."""
+        """Collect a batch, learn from it, and write and return the metrics.
+
+        Raises:
+            FloatingPointError: If the task or the update gives a number that is not finite.
+        """
         start = time.perf_counter()
         self.stopwatch.seconds.clear()
         batch = self.source.collect()
@@ -104,11 +108,11 @@ class Trainer:
         return metrics
 
     def restore(self, path: Path) -> None:
-        """Continue from the checkpoint file ``path``, bit for bit if it holds the whole state of the trajectory source.
+        """Continue from the checkpoint file ``path``, bit for bit if the trajectory source resumes its episodes.
 
         Raises:
-            ValueError: If the file is damaged or belongs to another configuration, or ``metrics.csv`` ends before it;
-                nothing is written then.
+            ValueError: If the file is damaged or belongs to another configuration, or if ``metrics.csv`` ends before
+                the checkpoint. Nothing is written in these cases.
         """
         load(self.checkpoint, path)
         if not self.source.resumes_episodes:
@@ -117,18 +121,18 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint."""
-        self.folder.metrics.flush()  # a run cannot resume from a checkpoint without the rows before it
+        self.folder.metrics.flush()  # resuming from a checkpoint needs all rows before it
         save(self.checkpoint, self.folder.checkpoints, step=self.progress.frames, config=self.folder.config)
 
     def _behaviour(self) -> TensorDictModuleBase:
         """Return the policy for collection, which writes only the keys that the loss reads."""
         actor = self.agent.actor
-        kept = {"action", actor.log_prob, *actor.stored}
-        keys = [key for key in dict.fromkeys(actor.policy.out_keys) if key in kept]
+        needed = {"action", actor.log_prob, *actor.stored}
+        keys = [key for key in dict.fromkeys(actor.policy.out_keys) if key in needed]
         return TensorDictSequential(actor.policy, selected_out_keys=keys)
 
     def _learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch: update normalisers last, so that source and losses use the same ones.
+        """Learn from a batch, and update the normalisers last, so that source and losses use the same statistics.
 
         Raises:
             FloatingPointError: If a number of the update is not finite.
@@ -140,23 +144,23 @@ class Trainer:
             metrics = self.update(batch, warming_up=warming_up)
         except FloatingPointError as error:
             raise FloatingPointError(
-                f"{error} in iteration {self.progress.iteration + 1}. The last checkpoint, "
-                f"{self.folder.checkpoints.latest()}, is from before; try a smaller step size or max_grad_norm"
+                f"{error} in iteration {self.progress.iteration + 1}. The last checkpoint before it is "
+                f"{self.folder.checkpoints.latest()}: try a smaller step size or max_grad_norm"
             ) from error
         if not warming_up:
             self._update_normalisers(batch)
         return metrics
 
     def _update_normalisers(self, batch: TensorDictBase) -> None:
-        """Merge the batch into the statistics of inputs."""
+        """Merge the batch into the statistics of the normalisers that are not frozen."""
         for key in ("observation", "goal"):
             if (name := f"{key}_normaliser") not in self.agent.frozen:
                 cast("RunningNormaliser", self.agent.parts[name]).update(batch[key])
 
     def _require_finite_task(self, batch: TensorDictBase) -> None:
-        """Check what the task returned, so that its mistakes are not taken for those of learning."""
-        returned = {key: batch[key] for key in ("observation", "goal")} | {"reward": batch["next", "reward"]}
-        if wrong := [name for name, value in returned.items() if not value.isfinite().all()]:
+        """Check the outputs of the task, so that an error of the task does not look like an error of learning."""
+        outputs = {key: batch[key] for key in ("observation", "goal")} | {"reward": batch["next", "reward"]}
+        if wrong := [name for name, value in outputs.items() if not value.isfinite().all()]:
             raise FloatingPointError(
                 f"{' and '.join(wrong)} of {type(self.source.env).__name__} became nan or infinite in iteration "
                 f"{self.progress.iteration + 1}: correct the task"
@@ -164,7 +168,7 @@ class Trainer:
 
     def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         returns, lengths = self.episodes.update(batch)
-        if self.episodes.steps < self.source.env.max_episode_steps:  # only episodes that fell have ended
+        if self.episodes.steps < self.source.env.max_episode_steps:  # so far, only episodes with a fall have ended
             returns = returns.new_empty(0)
         return {
             "episode/count": len(lengths),
@@ -185,7 +189,7 @@ class Trainer:
         return metrics
 
     def _advance(self, metrics: dict[str, float], seconds: float) -> None:
-        """Count the iteration, write its metrics, and save a checkpoint if due."""
+        """Count the iteration, write its metrics, and save a checkpoint if one is due."""
         progress = self.progress
         progress.iteration += 1
         progress.frames += self.settings.frames_per_batch

@@ -1,4 +1,4 @@
-"""Transfer: the parts that a method keeps, freezes and re-initialises for a new task (Algorithm 1)."""
+"""Transfer: which parts a method keeps, freezes and re-initialises for a new task (Algorithm 1)."""
 
 import hashlib
 from collections.abc import Collection, Iterable
@@ -10,14 +10,14 @@ from torchrl_mcp.modules import RunningNormaliser
 
 
 class FrozenParts:
-    """Parts that training must not change, with a check of their bits.
+    """Parts that training must not change, which is checked bit by bit.
 
     Args:
         parts: All parts of an agent by name.
         names: Parts to freeze: their parameters require no gradients, and normalisers among them stop updating.
 
     Raises:
-        ValueError: If a name is not a part.
+        ValueError: If a name is not the name of a part.
     """
 
     def __init__(self, parts: nn.ModuleDict, names: Collection[str]) -> None:
@@ -30,7 +30,7 @@ class FrozenParts:
         return name in self.modules
 
     def state_dict(self) -> dict[str, str]:
-        """Return the fingerprints, so that a resumed run is checked against its first ones."""
+        """Return the fingerprints, so that a resumed run is checked against the fingerprints of its beginning."""
         return dict(self.fingerprints)
 
     def load_state_dict(self, state: dict[str, str]) -> None:
@@ -45,11 +45,15 @@ class FrozenParts:
         """
         for name, module in self.modules.items():
             if fingerprint(module) != self.fingerprints[name]:
-                raise RuntimeError(f"the frozen part {name!r} changed during training: a bug, please report it")
+                raise RuntimeError(f"the frozen part {name!r} changed during training: please report this bug")
 
 
 def require_parts(parts: nn.ModuleDict, names: Iterable[str], argument: str) -> None:
-    """Raise a ``ValueError`` if some of ``names``, given as ``argument``, are not among ``parts``."""
+    """Check that ``names`` are names of ``parts``.
+
+    Raises:
+        ValueError: If a name is not; the message calls the names ``argument``.
+    """
     if unknown := sorted(set(names) - set(parts)):
         raise ValueError(f"{argument} names {unknown}, but the parts of this method are {sorted(parts)}")
 
@@ -63,7 +67,8 @@ def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Co
         freeze: Parts that do not change.
 
     Raises:
-        ValueError: If the normaliser of their inputs may change, is not kept with them, or the critic is frozen.
+        ValueError: If the input normaliser of frozen networks is not frozen too, if it is not kept although frozen
+            networks are, or if the critic is frozen.
     """
     if "critic" in freeze:
         raise ValueError("transfer.freeze names the critic, which learns in every stage: leave it out")
@@ -73,24 +78,29 @@ def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Co
         return
     if normaliser not in freeze:
         raise ValueError(
-            f"transfer.freeze names {networks}, whose outputs change with {normaliser}: add it to transfer.freeze"
+            f"transfer.freeze names {networks}, whose outputs change with the {normaliser}: add {normaliser} to "
+            "transfer.freeze"
         )
     if normaliser not in keep and not set(networks).isdisjoint(keep):
-        raise ValueError(f"transfer.keep names parts that need the {normaliser} of their pre-training: add it as well")
+        raise ValueError(
+            f"transfer.keep names parts that need the {normaliser} of their pre-training: add {normaliser} to "
+            "transfer.keep"
+        )
 
 
 @torch.no_grad()
 def widen_goal(wide: nn.Module, narrow: nn.Module, entry: slice) -> None:
-    """Copy a network that saw a goal into one that sees it as an entry of its own goal.
+    """Copy the weights of a network into one whose goal contains the first network's goal as an entry.
 
-    At first, the wide network ignores the other entries: their weights are zero, and normalisers have no samples of
-    them.
+    At first, the wide network ignores the other entries of its goal: their weights are zero, and its normalisers have
+    no samples of these features.
 
     Args:
-        wide: New network whose last inputs are the goal, ``G``.
-        narrow: The same for the goal of the entry's size, whose weights are copied. Its normalisers count the samples
-            of each feature by itself from then on.
-        entry: The entry.
+        wide: New network, whose last inputs are its goal, ``G``. From now on, its normalisers count samples per
+            feature.
+        narrow: Network with the same layers, whose goal has the size of ``entry``. Its normalisers also change to
+            counting per feature.
+        entry: Place of the narrow network's goal in the goal of the wide network.
     """
     for module in (*wide.modules(), *narrow.modules()):
         if isinstance(module, RunningNormaliser):

@@ -1,5 +1,6 @@
-"""The update of PPO: gradient steps of actor and critic in passes over a batch."""
+"""PPO's update: gradient steps of actor and critic in several passes over a batch."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +23,7 @@ from torchrl_mcp.training.transfer import FrozenParts
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """The numbers of a training.
+    """Numbers of steps, batches and passes of a training.
 
     Args:
         num_envs: Number of environments, ``N``.
@@ -30,14 +31,14 @@ class PPOSettings:
         frames_per_batch: Environment steps per iteration, ``N * T``.
         minibatch_size: Samples per gradient step.
         num_epochs: Passes over each batch.
-        warmup_batches: First batches, which train only normalisers and critic, so that the actor's first step has
-            inputs of unit variance and meaningful advantages.
-        max_grad_norm: Largest gradient norm, of actor and critic each, or None to leave gradients as they are.
+        warmup_batches: Number of first batches that train only normalisers and critic, so that the actor's first step
+            has inputs of unit variance and meaningful advantages.
+        max_grad_norm: Largest norm of the actor's gradient and of the critic's gradient; None disables clipping.
         checkpoint_interval: Iterations between checkpoints.
-        autocast: Compute all networks in bfloat16, both in collection and in the losses.
+        autocast: Whether to compute all networks in bfloat16, in collection and in the losses.
 
     Raises:
-        ValueError: If the batch is not a multiple of the number of environments and of the minibatch.
+        ValueError: If ``frames_per_batch`` is not a multiple of ``num_envs`` and of ``minibatch_size``.
     """
 
     num_envs: int
@@ -82,7 +83,7 @@ class Agent:
 
     @property
     def spare_parts(self) -> set[str]:
-        """Names of the parts that act in no state: the critic, unless its values choose the option."""
+        """Names of the parts that the policy does not need: the critic, unless its values choose the option."""
         acting = {id(parameter) for parameter in self.actor.policy.parameters()}
         return {"critic"} if acting.isdisjoint(map(id, self.parts["critic"].parameters())) else set()
 
@@ -99,18 +100,19 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True)
 class Objective:
-    """What is optimised, and how.
+    """Advantages, losses and optimisers of actor and critic.
 
     Args:
         advantages: From trajectories ``(N, T)`` to samples of any batch shape, with the keys ``advantages.out_keys``
             that the losses read in addition to the policy's stored keys.
-        losses: Losses by the names of ``optimizers``: each minimises the sum of the outputs that begin with ``loss_``.
-            The actor's reports what an :class:`~torchrl_mcp.objectives.ActorLoss` does.
-        optimizers: Optimisers of the ``critic`` and, unless it is frozen, the ``actor``.
-        schedule: Adapts the actor's step size to the KL divergence of each update, or None.
+        losses: Losses by the names of ``optimizers``. Each optimiser minimises the sum of the outputs whose names begin
+            with ``loss_``. The actor's loss reports the same outputs as
+            :class:`~torchrl_mcp.objectives.ActorLoss`.
+        optimizers: Optimisers of the ``critic`` and, unless the actor is frozen, of the ``actor``.
+        schedule: Adapts the actor's step size to the KL divergence of each update; None keeps the step size.
 
     Raises:
-        ValueError: If the actor's loss does not declare what it has to report.
+        ValueError: If the actor's loss does not declare the outputs that it must report.
     """
 
     advantages: Estimator
@@ -128,9 +130,9 @@ class Update:
     """Gradient steps of an agent in several passes over the samples of a batch.
 
     Args:
-        agent: The agent.
-        objective: What is optimised.
-        settings: The numbers of the training.
+        agent: The networks.
+        objective: Advantages, losses and optimisers.
+        settings: Numbers of steps, batches and passes.
     """
 
     def __init__(self, agent: Agent, objective: Objective, settings: PPOSettings) -> None:
@@ -140,24 +142,24 @@ class Update:
         self.dead_units = DeadUnits(agent.parts)
 
     def precision(self) -> torch.autocast:
-        """Return a context in which networks compute, in bfloat16 if the settings say so."""
-        # A new context for every use: within one, autocast reuses its outdated copies of the weights.
+        """Return a context in which networks compute in the precision of the settings."""
+        # Every use needs a new context: within one context, autocast reuses outdated copies of the weights.
         return torch.autocast(self.agent.device.type, torch.bfloat16, enabled=self.settings.autocast)
 
     def __call__(self, batch: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
-        """Learn from trajectories ``(N, T)``; return the means of the losses' outputs, and of exploration.
+        """Learn from trajectories ``(N, T)``, and return the means of the losses' outputs and of exploration.
 
         While ``warming_up``, the actor does not learn and only reports its loss.
 
         Raises:
-            FloatingPointError: If a number is not finite.
+            FloatingPointError: If an output of a loss is not finite.
         """
         with self.precision():
             samples = self.objective.advantages(batch)
         return self.learn(samples, warming_up=warming_up)
 
     def learn(self, samples: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
-        """Learn from samples with advantages, of any batch shape, as from trajectories."""
+        """Learn from samples of any batch shape that already have advantages; else as :meth:`__call__`."""
         actor = self.agent.actor
         keys = ["observation", "goal", actor.sampled, actor.log_prob, *actor.stored]
         samples = samples.select(*keys, *self.objective.advantages.out_keys).flatten()
@@ -179,7 +181,7 @@ class Update:
         return metrics | self._network_metrics(samples)
 
     def _run(self, tasks: Mapping[str, Callable[[], list[TensorDictBase]]]) -> dict[str, list[TensorDictBase]]:
-        """Return the reports of actor and critic, which share only the samples: on a CPU they learn in parallel."""
+        """Return the reports of actor and critic, which learn in parallel on a CPU: they share only the samples."""
         if self.agent.device.type == "cpu":
             return side_by_side(tasks)
         return {name: task() for name, task in tasks.items()}
@@ -197,7 +199,7 @@ class Update:
 
     @torch.no_grad()
     def _report_without_learning(self, samples: TensorDictBase) -> list[TensorDictBase]:
-        """Return the outputs of the actor's loss with log-probabilities under the current normalisers."""
+        """Return the outputs of the actor's loss, with log-probabilities under the current normalisers."""
         actor = self.agent.actor
         with self.precision():
             distribution = actor.trained.get_dist(samples)
@@ -227,7 +229,7 @@ class Update:
 
 
 def _divergence(reports: list[TensorDictBase]) -> float:
-    """Return the KL divergence of an update, by the low-variance estimate :math:`E[(r - 1) - log r]`.
+    r"""Return the KL divergence of an update, by the low-variance estimate :math:`E[(r - 1) - \log r]`.
 
     Reference:
         Schulman, *Approximating KL Divergence*, 2020. http://joschu.net/blog/kl-approx.html
@@ -237,7 +239,7 @@ def _divergence(reports: list[TensorDictBase]) -> float:
 
 
 def _spread(distribution: Distribution) -> dict[str, float]:
-    """Return a measure of exploration."""
+    """Return the mean entropy of a choice among options, or the mean standard deviation of an action."""
     if isinstance(distribution, Categorical):
         return {"policy/entropy": distribution.entropy().mean().item()}
     return {"policy/std": distribution.stddev.mean().item()}
@@ -252,5 +254,5 @@ def _mean(reports: list[TensorDictBase]) -> dict[str, float]:
 
 def _require_finite(metrics: Mapping[str, float]) -> None:
     for key, value in metrics.items():
-        if not abs(value) < float("inf"):
+        if not math.isfinite(value):
             raise FloatingPointError(f"{key} became {value}")

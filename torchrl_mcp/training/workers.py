@@ -1,4 +1,4 @@
-"""Worker processes: detecting workers that died, ending them, and ending workers whose parent died."""
+"""Supervises worker processes: notices workers that end, ends all workers after a failure or with their parent."""
 
 import multiprocessing
 import os
@@ -19,7 +19,7 @@ INTERVAL = 0.5
 """Seconds between checks of the workers."""
 
 PATIENCE = 5.0
-"""Seconds for the reason of a worker that has ended to arrive."""
+"""Seconds to wait for the reason of a worker that has ended."""
 
 
 def attend(task: Callable[[], Result], workers: Sequence[BaseProcess]) -> Result:
@@ -46,53 +46,53 @@ def begun(start: Callable[[], Result]) -> Result:
     """Return the result of ``start``, which starts workers, or fail as soon as one of them fails or ends.
 
     Raises:
-        ChildProcessError: If a worker ends, or fails with another error than those below.
-        OSError: Of a worker or of ``start``.
-        ValueError: Likewise.
+        ChildProcessError: If a worker ends, or fails with an error other than the two below.
+        OSError: If a worker or ``start`` raises this error.
+        ValueError: If a worker or ``start`` raises this error.
     """
-    others = _processes()
+    earlier = _processes()
     outcome: Future[Result] = Future()
     thread = threading.Thread(target=_fulfil, args=(outcome, start), daemon=True)
     thread.start()
     workers: list[BaseProcess] = []
     while thread.is_alive():
         thread.join(INTERVAL / 10)
-        workers += [process for process in _started_beside(others) if process not in workers]
+        workers += [process for process in _started_after(earlier) if process not in workers]
         try:
             _require_alive(workers)
         except ChildProcessError:
-            thread.join(PATIENCE)  # a worker that fails says why before it ends
+            thread.join(PATIENCE)  # a worker that fails sends the reason before it ends
             if not outcome.done():
                 raise
     error = outcome.exception()
     if error is None or not isinstance(error, Exception) or isinstance(error, (OSError, ValueError)):
         return outcome.result()
-    if isinstance(error.__cause__, EOFError):  # a worker ended without a word, perhaps before the first look
-        _require_alive(_started_beside(others))
+    if isinstance(error.__cause__, EOFError):  # a worker ended without a reason, perhaps before the first check
+        _require_alive(_started_after(earlier))
     raise failure("a worker failed while it started", error) from error
 
 
 def failure(event: str, error: Exception) -> ChildProcessError:
-    """Return an error that commands explain, of one whose message may be a worker's whole traceback."""
+    """Return an error with the last line of another error, whose message may be the whole traceback of a worker."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return ChildProcessError(f"{event}: {lines[-1].rstrip('.')}")
 
 
 @contextmanager
 def new_workers() -> Iterator[list[BaseProcess]]:
-    """Yield a list, to which the processes that the block spawns are added; if the block fails, end them."""
-    others = _processes()
+    """Yield a list that receives the processes which the block spawns; if the block fails, end the processes."""
+    earlier = _processes()
     workers: list[BaseProcess] = []
     method = multiprocessing.get_start_method(allow_none=True)
-    multiprocessing.set_start_method("spawn", force=True)  # in its jobs, joblib sets a method of its own
+    multiprocessing.set_start_method("spawn", force=True)  # joblib sets another start method in its jobs
     try:
         yield workers
     except BaseException:
-        end(_started_beside(others))
+        end(_started_after(earlier))
         raise
     finally:
         multiprocessing.set_start_method(method, force=True)
-    workers += _started_beside(others)
+    workers += _started_after(earlier)
 
 
 def end(workers: Sequence[BaseProcess]) -> None:
@@ -105,29 +105,31 @@ def end(workers: Sequence[BaseProcess]) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process as soon as its parent has ended, for any reason, and leave interrupts to the parent."""
+    """End this process as soon as its parent has ended for any reason, and ignore interrupts."""
     if multiprocessing.parent_process() is None:
         return
-    # An interrupt goes to parent and children alike; only the parent handles it.
+    # An interrupt reaches the parent and all children; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
 
 
 def end_with_parent_while_starting() -> None:
-    """End a process that ``multiprocessing`` is spawning as soon as its parent has ended, even during its imports.
+    """End a process that ``multiprocessing`` is spawning as soon as its parent has ended, even during imports.
 
-    The imports of a worker take seconds, and :func:`end_with_parent` is called after them. No effect on Windows.
+    The imports of a worker take seconds, and :func:`end_with_parent` takes effect only after them. On Windows this
+    function does nothing.
     """
     if "--multiprocessing-fork" not in sys.orig_argv or sys.platform == "win32":
         return
     if pipe := re.search(r"pipe_handle=(\d+)", " ".join(sys.orig_argv)):
-        # The parent may have ended already, so that its number is of no use; the other end of the pipe is closed then.
+        # The parent may have ended already, and its process number may be in use again. The pipe is safe: its other end
+        # closes when the parent ends.
         threading.Thread(target=_follow, args=(os.dup(int(pipe[1])),), daemon=True).start()
 
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """Take SIGTERM, as ``kill`` and schedulers send it, for an interrupt while the block runs, so that it cleans up."""
+    """Turn SIGTERM, which ``kill`` and schedulers send, into an interrupt during the block, so that it cleans up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -135,26 +137,26 @@ def termination_as_interrupt() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    former = signal.signal(signal.SIGTERM, interrupt)
+    previous_handler = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, former)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
 def _processes() -> set[BaseProcess]:
-    """Return the processes that this one has started, also ended ones that are still in use."""
-    # active_children() forgets a process that ended before anyone saw it.
+    """Return the processes that this process has started, including ended ones that an object still refers to."""
+    # active_children() would omit a process that ended before the first check.
     return {process for process in set(_dangling) if _number(process)}
 
 
-def _started_beside(others: set[BaseProcess]) -> list[BaseProcess]:
-    """Return the processes that this one has started and that are not among ``others``, in the order of their start."""
-    return sorted(_processes() - others, key=_number)
+def _started_after(earlier: set[BaseProcess]) -> list[BaseProcess]:
+    """Return the processes of :func:`_processes` that are not among ``earlier``, in the order of their start."""
+    return sorted(_processes() - earlier, key=_number)
 
 
 def _number(process: BaseProcess) -> int:
-    """Return the number of a process, or 0 if it has not been started, or has been closed."""
+    """Return the number of a process, or 0 if the process has not been started or has been closed."""
     try:
         return process.pid or 0
     except ValueError:
@@ -169,7 +171,7 @@ def _follow_parent() -> None:
 
 
 def _follow(pipe: int) -> None:
-    """End this process as soon as nobody can write to a pipe any longer."""
+    """End this process as soon as the other end of a pipe is closed."""
     hang_up = select.poll()
     hang_up.register(pipe, 0)
     hang_up.poll()
@@ -190,13 +192,13 @@ def _require_alive(workers: Sequence[BaseProcess]) -> None:
                 f"signal {signal.Signals(-code).name}" if code < 0 and sys.platform != "win32" else f"exit code {code}"
             )
             raise ChildProcessError(
-                f"worker {number} (process {process.pid}) has ended by {how}. It may have said why above; SIGKILL "
-                "often means that memory ran out: try fewer collector.num_workers or training.num_envs"
+                f"worker {number} (process {process.pid}) has ended by {how}. The output above may give the reason. "
+                "SIGKILL often means a lack of memory: reduce collector.num_workers or training.num_envs"
             )
 
 
 def _exit_code(process: BaseProcess) -> int | None:
-    """Return the exit code of a process, or None if it is alive, or if TorchRL closed it after another one ended."""
+    """Return the exit code of a process, or None if it is alive, or if TorchRL closed it after another worker ended."""
     try:
         return process.exitcode
     except ValueError:

@@ -1,4 +1,4 @@
-"""Weights of primitives as bars in a corner of a picture."""
+"""Draws the weights of primitives as bars into a corner of a picture."""
 
 from collections.abc import Sequence
 
@@ -7,11 +7,11 @@ from PIL import Image, ImageDraw, ImageFont
 from torchrl_mcp.analysis.figures import FAINT, INK, colours
 
 ROW, LENGTH = 1 / 22, 1 / 4
-"""Height of a bar's row and length of a bar of weight 1, both relative to the height of the picture."""
+"""Height of a row, and length of a bar of weight 1, relative to the height of the picture."""
 
 
 def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> None:
-    """Draw weights as numbered bars into the upper left corner, each on a track for weight 1.
+    """Draw weights as numbered bars into the upper left corner, each on a track that shows weight 1.
 
     Args:
         picture: RGB picture, changed in place.
@@ -22,7 +22,8 @@ def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> Non
     row = round(picture.height * ROW)
     length = round(picture.height * LENGTH)
     font = ImageFont.load_default(0.8 * row)
-    left, top, gap = 2 * row, 2 * row, max(1, row // 6)
+    left, top = 2 * row, 2 * row
+    gap = max(1, row // 6)
     plate = (row // 2, row // 3, left + length + row // 2, top + len(weights) * row + row // 3)
     corner = picture.crop(plate)
     picture.paste(Image.blend(corner, Image.new("RGB", corner.size, "white"), 0.6), plate)

@@ -1,4 +1,4 @@
-"""Films of policies."""
+"""Renders policies as films."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,19 +22,20 @@ from torchrl_mcp.viewer.player import Player
 from torchrl_mcp.viewer.scenery import softly_lit
 
 AZIMUTH, ELEVATION = 115.0, -26.0
-"""Camera angles in degrees: a character walking along x is seen from the right, a little from the front and above."""
+"""Angles of the camera in degrees, which sees a character that walks along x from the right, from slightly in front
+and from above."""
 
 DISTANCE = 2.8
-"""Distance of the camera, in extents of the character."""
+"""Distance of the camera from the character, as a multiple of the character's extent."""
 
 LAG = 0.25
-"""Time constant in seconds with which the camera follows the character."""
+"""Time constant with which the camera follows the character, in seconds."""
 
 
 def film(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
     """Play, and draw the character, the target or reference of its task, and the weights of its primitives.
 
-    The camera follows smoothly, and cuts when an episode begins.
+    The camera follows the character smoothly, and jumps when an episode begins.
 
     Args:
         player: The player to film.
@@ -50,7 +51,7 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
         RuntimeError: If no OpenGL library for drawing without a display is found.
     """
     if not player.simulated:
-        yield from own_pictures(player, seconds=seconds, width=width, height=height, every=every)
+        yield from rendered_pictures(player, seconds=seconds, width=width, height=height, every=every)
         return
     timestep = player.env.control_timestep
     model = softly_lit(player.env.simulation.model)
@@ -61,7 +62,7 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
     camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
     camera.view.lookat = player.data.subtree_com[1]
     lag = min(1.0, player.extent)  # small characters leave the picture sooner
-    fixed = model.light_bodyid == 0  # fixed lights move with the character, because shadows are drawn only near them
+    fixed = model.light_bodyid == 0  # these lights follow the character, because MuJoCo draws shadows only near them
     try:
         for step in range(round(seconds / timestep)):
             player.step()
@@ -76,8 +77,8 @@ def film(player: Player, *, seconds: float, width: int, height: int, every: int)
         camera.close()
 
 
-def own_pictures(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
-    """Play, and let an environment of another library draw itself, as :func:`film`."""
+def rendered_pictures(player: Player, *, seconds: float, width: int, height: int, every: int) -> Iterator[Image.Image]:
+    """Play, and yield pictures that an environment of another library renders; arguments as of :func:`film`."""
     for step in range(round(seconds / player.env.control_timestep)):
         player.step()
         if step % every == every - 1:
@@ -93,9 +94,14 @@ def _with_weights(picture: Image.Image, player: Player) -> Image.Image:
 
 
 def followed(place: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
-    r"""Return the camera's next focus from its last and its target, ``(3,)``: :math:`x + (1 - e^{-t/\tau}) (x^* - x)`.
+    r"""Return the next focus of the camera, :math:`x + (1 - e^{-t/\tau}) (x^* - x)`.
 
-    It stays :math:`v \tau` behind a target of constant velocity v, with :math:`\tau` :data:`LAG`.
+    The focus stays :math:`v \tau` behind a target of constant velocity :math:`v`, where :math:`\tau` is :data:`LAG`.
+
+    Args:
+        place: Last focus :math:`x`, ``(3,)``, in metres.
+        target: Position :math:`x^*` of the character, ``(3,)``, in metres.
+        seconds: Time :math:`t` since the last focus.
     """
     return place + (1 - math.exp(-seconds / LAG)) * (target - place)
 
@@ -112,7 +118,7 @@ def save_film(
     num_options: int = 0,
     aside: float = 1.0,
 ) -> None:
-    """Write :func:`film` as an animated GIF or an MP4 that plays at the speed of the simulation.
+    """Write a :func:`film` as an animated GIF or an MP4 that plays in real time.
 
     Args:
         policy: From the environment's observations to ``action``, on the CPU.
@@ -121,9 +127,9 @@ def save_film(
         seconds: Duration in seconds.
         width: Width in pixels.
         height: Height in pixels.
-        deterministic: Play the deterministic action rather than a sample.
+        deterministic: Play the deterministic action instead of a sample.
         num_options: Number of options of the policy, 0 without options.
-        aside: Distance of a ghost from the character, in extents of the character.
+        aside: Distance of a ghost from the character, as a multiple of the character's extent.
 
     Raises:
         RuntimeError: If no OpenGL library for drawing without a display is found.
@@ -134,10 +140,10 @@ def save_film(
 
 
 def save_films(players: Mapping[str, Player], path: Path, *, seconds: float, width: int, height: int) -> None:
-    """Write the :func:`film` of every player, side by side in one animated GIF or MP4.
+    """Write the :func:`film` of every player, side by side, as one animated GIF or MP4.
 
     Args:
-        players: Players by the titles of their pictures, with equal control steps.
+        players: Players by the titles of their pictures, all with the same control timestep.
         path: The file, ``.gif`` or ``.mp4``.
         seconds: Duration in seconds.
         width: Width of each player's picture in pixels.
@@ -182,12 +188,12 @@ def _counted(pictures: Iterable[Image.Image], shown: tqdm) -> Iterator[Image.Ima
 
 
 def save_mp4(pictures: Iterable[Image.Image], path: Path, *, interval: float) -> None:
-    """Write RGB pictures as an MP4 (H.264), one every ``interval`` seconds; needs imageio-ffmpeg."""
+    """Write RGB pictures, one every ``interval`` seconds, as an MP4 (H.264) with imageio-ffmpeg."""
     ffmpeg = import_module(ENCODER)
     writer = None
     for picture in pictures:
         if writer is None:
-            # H.264 halves the resolution of colours: the sizes must be even.
+            # H.264 halves the resolution of colours, so width and height must be even.
             writer = ffmpeg.write_frames(str(path), picture.size, fps=1 / interval, macro_block_size=2)
             writer.send(None)
         writer.send(np.asarray(picture))

@@ -1,8 +1,8 @@
-"""Access control for MuJoCo Studio's web server: this machine alone, and never pages of other sites.
+"""Restricts MuJoCo Studio's web server to this machine, and refuses requests from pages of other sites.
 
-Studio listens on every interface, gives the first visitor control of the simulation, loads uploaded models, and has no
-setting for any of this. :func:`guarded` gives it another socket and checks every request. If a version of Studio takes
-neither, its viewer is refused.
+By default Studio listens on every interface, gives the first visitor control of the simulation and loads uploaded
+models, and no setting changes this. :func:`guarded` replaces its socket and checks every request. A version of Studio
+in which this is impossible is refused.
 """
 
 import logging
@@ -15,39 +15,39 @@ import mujoco
 
 from torchrl_mcp.viewer.studio import web_server, web_viewer
 
-HERE = "127.0.0.1"
-"""Address for access from this machine alone."""
+LOOPBACK = "127.0.0.1"
+"""Address that only this machine can reach."""
 
-NAMES = (HERE, "localhost")
-"""Names of the viewer's address: a stranger's DNS name may resolve to this machine, too."""
+NAMES = (LOOPBACK, "localhost")
+"""Permitted names of the viewer. The DNS name of an attacker may resolve to this machine, too."""
 
 FITTING = b"""<meta name="viewport" content="width=device-width, initial-scale=1">
 <style>canvas { height: 100dvh }</style>
 """
-"""What Studio's page lacks: without it a small screen shows the page 980 pixels wide, and hides its lower edge."""
+"""Lines that Studio's page lacks: otherwise a small screen shows the page 980 pixels wide and hides its lower edge."""
 
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Let a viewer that the block opens listen on this machine alone, and check requests with :func:`refusal`.
+    """Let the viewer that the block opens listen on this machine only, and check its requests with :func:`refusal`.
 
-    The viewer logs warnings alone, not every connection of a browser.
+    The viewer logs only warnings, not every connection of a browser.
 
     Raises:
-        RuntimeError: If this version of Studio opens its server in another way, so that nobody knows who sees it.
+        RuntimeError: If this version of Studio opens its server in another way, so that access cannot be restricted.
     """
     names = ((web_server, "bind_public_socket"), (web_server, "serve"), (web_viewer, "_print_url_banner"))
     if not all(hasattr(module, name) for module, name in names):
         raise RuntimeError(
-            f"MuJoCo Studio {mujoco.__version__} opens its web server in a way that is not known to be safe: use "
-            "--viewer window, or install mujoco 3.17 or 4.0"
+            f"MuJoCo Studio {mujoco.__version__} opens its web server in a way to which access cannot be restricted: "
+            "use --viewer window, or install mujoco 3.17 or 4.0"
         )
     level = web_server.logger.level
     bind = web_server.bind_public_socket
     serve = web_server.serve
     banner = web_viewer._print_url_banner
     web_server.logger.setLevel(logging.WARNING)
-    web_server.bind_public_socket = lambda _, port=0: bind(HERE, port)
+    web_server.bind_public_socket = lambda _, port=0: bind(LOOPBACK, port)
     web_server.serve = _checking(serve)
     web_viewer._print_url_banner = lambda _, port: print(_greeting(port), flush=True)
     try:
@@ -60,22 +60,22 @@ def guarded() -> Iterator[None]:
 
 
 def refusal(headers: Mapping[str, str]) -> str | None:
-    """Return why a request is refused, or None if it is not.
+    """Return the reason why a request is refused, or None if the request is permitted.
 
     Args:
-        headers: Headers ``Host`` and, if a browser sends it, ``Origin``.
+        headers: Headers of the request, of which ``Host`` and ``Origin`` are read.
     """
     host = headers.get("Host", "")
     origin = headers.get("Origin")
     if urlsplit(f"//{host}").hostname not in NAMES:
-        return f"the viewer answers to {' and '.join(NAMES)} alone: call it by one of them"
+        return f"the viewer must be opened as {' or '.join(NAMES)}"
     if origin is not None and urlsplit(origin).netloc != host:
-        return "pages of other sites may not use the viewer"
+        return "pages of other sites must not use the viewer"
     return None
 
 
 def fitted(response: Any) -> Any:
-    """Let a page fit the width and height of a screen; return other responses, and None, as they are."""
+    """Add :data:`FITTING` to a page, so that it fits the screen; return other responses, and None, unchanged."""
     if response is None or not response.headers.get("Content-Type", "").startswith("text/html"):
         return response
     response.body = response.body.replace(b"</head>", FITTING + b"</head>", 1)
@@ -85,7 +85,7 @@ def fitted(response: Any) -> Any:
 
 
 def _checking(serve: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:
-    """Return a function that serves like another, and answers requests only after checking them."""
+    """Return a function that serves like ``serve``, but checks every request first."""
 
     def checking(handler: Callable[..., Awaitable[Any]], *, process_request: Callable, **settings: Any) -> Any:
         def admit(connection: Any, request: Any) -> Any:
@@ -100,6 +100,6 @@ def _checking(serve: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[A
 
 def _greeting(port: int) -> str:
     return (
-        f"http://localhost:{port}/, for this machine alone. Ctrl+C ends it. From another machine: "
-        f"ssh -L {port}:localhost:{port} USER@THIS_MACHINE, then open the same address there"
+        f"Open http://localhost:{port}/ on this machine; Ctrl+C ends the viewer. From another machine, run "
+        f"ssh -L {port}:localhost:{port} USER@THIS_MACHINE there and open the same address"
     )

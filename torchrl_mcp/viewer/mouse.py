@@ -1,7 +1,7 @@
-"""The left mouse button in the web viewer: it drags bodies, and a click on the ground chooses a place.
+"""The left mouse button of the web viewer: it drags bodies, and a click on the ground chooses a place.
 
-In Studio, dragging needs a double-click to select, then a key and another button. This module calls the same functions
-of Studio with the left button.
+In Studio, dragging needs a double-click that selects the body, then a key and another button. This module calls the
+same functions of Studio with the left button alone.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ class Mouse:
     """Handles the left mouse button in the scene of a viewer.
 
     Args:
-        choose: Called with the clicked point on the ground, ``(3,)`` in metres.
+        choose: Called with the clicked point on the ground, ``(3,)``, in metres.
     """
 
     def __init__(self, choose: Callable[[np.ndarray], None]) -> None:
@@ -28,7 +28,7 @@ class Mouse:
         self._pressed: tuple[float, float, np.ndarray] | None = None  # press on the ground: pixels, and point
 
     def handle(self, viewer: viewer_protocol.Viewer) -> bool:
-        """Process a frame's input; return whether a body is dragged, in which case the camera must not move."""
+        """Process the input of a frame, and return whether a body is dragged: then the camera must not move."""
         io = imgui.GetIO()
         if self._dragging:
             self._drag(viewer, io)
@@ -61,7 +61,7 @@ class Mouse:
             self._dragging = True
 
     def _drag(self, viewer: viewer_protocol.Viewer, io: imgui.IO) -> None:
-        """Drag the body in the vertical plane, or with Shift the horizontal plane, until the button is released."""
+        """Drag the body in the vertical plane, or with Shift in the horizontal plane, until the button is released."""
         if not imgui.IsMouseDown(imgui.MouseButton.Left):
             viewer.perturb.active = 0
             self._dragging = False
@@ -72,7 +72,7 @@ class Mouse:
 
 
 def _pick(viewer: viewer_protocol.Viewer, io: imgui.IO) -> ux.PickResult:
-    """Return the body and point under the mouse."""
+    """Return the body under the mouse, and the point on it."""
     size = io.DisplaySize
     place = io.MousePos.x / size.x, io.MousePos.y / size.y
     return ux.Pick(viewer.model, viewer.data, viewer.camera, *place, size.x / size.y, viewer.vis_options)

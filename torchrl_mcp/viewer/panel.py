@@ -1,4 +1,4 @@
-"""The panel of the web viewer: a slider for the target direction, and the gates as bars that can be dragged."""
+"""The panel of the web viewer: a slider for the target direction, and a bar for every gate, which can be dragged."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,14 +17,14 @@ WIDTH, HEIGHT = 160.0, 14.0
 """Size of a bar in pixels."""
 
 NARROW = 500
-"""Width of a display in pixels below which Studio's box at the top would cover most of the panel."""
+"""Displays of fewer pixels show the panel at the bottom, because Studio's box at the top would cover it."""
 
 
 def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], None]) -> None:
-    """Draw the panel for a frame.
+    """Draw the panel for one frame.
 
     Args:
-        steering: Current steering, read-only.
+        steering: Current steering, which is only read.
         weights: Weights of the primitives, or None without primitives.
         send: Called with the user's commands.
     """
@@ -46,16 +46,19 @@ def draw(steering: Steering, weights: Weights | None, send: Callable[[Command], 
     if imgui.Button("new episode"):
         send(Steering.reset)
     imgui.SameLine()
-    if imgui.Button("let go"):
-        send(Steering.let_go)
+    if imgui.Button("release all"):
+        send(Steering.release_all)
     imgui.TextDisabled(f"drag a body: push\nspace: {'stop' if steering.can_stop else 'pause'}   - =: slower, faster")
     if not steering.has_speed:
-        imgui.TextDisabled("up, down: one primitive alone")
+        imgui.TextDisabled("up, down: let one primitive act alone")
     imgui.End()
 
 
 def place(width: float, height: float) -> tuple[imgui.Vec2, int, imgui.Vec2]:
-    """Return where the panel begins, when, and which of its corners that is: on a phone below Studio's box.
+    """Return position, condition and pivot of the panel, as :func:`imgui.SetNextWindowPos` expects them.
+
+    The panel begins in the upper left corner, or on narrow displays in the lower left corner, where Studio's box does
+    not cover it.
 
     Args:
         width: Width of the display in pixels.
@@ -63,14 +66,15 @@ def place(width: float, height: float) -> tuple[imgui.Vec2, int, imgui.Vec2]:
     """
     if width >= NARROW:
         return imgui.Vec2(16, 48), int(imgui.Cond.FirstUseEver), imgui.Vec2(0, 0)
-    return imgui.Vec2(16, height - 48), int(imgui.Cond.Always), imgui.Vec2(0, 1)  # the first size is not the browser's
+    # In every frame, because the first size of the display is not yet the browser's.
+    return imgui.Vec2(16, height - 48), int(imgui.Cond.Always), imgui.Vec2(0, 1)
 
 
 def _draw_weights(steering: Steering, weights: Weights, send: Callable[[Command], None]) -> None:
-    """Draw a bar for each primitive. Dragging a bar pins its gate; its number lets the primitive act alone."""
+    """Draw a bar for each primitive. Dragging it pins the gate; a click on its number lets the primitive act alone."""
     imgui.Text(weights.title)
-    for number, (value, shown) in enumerate(zip(weights.values, colours(len(weights.values)), strict=True)):
-        red, green, blue = (part / 255 for part in ImageColor.getrgb(shown)[:3])
+    for number, (value, colour) in enumerate(zip(weights.values, colours(len(weights.values)), strict=True)):
+        red, green, blue = (part / 255 for part in ImageColor.getrgb(colour)[:3])
         corner = imgui.GetCursorPos()
         imgui.PushStyleColor(int(imgui.Col.PlotHistogram), imgui.Vec4(red, green, blue, 1.0))
         imgui.ProgressBar(steering.player.pinned.get(number, value), imgui.Vec2(WIDTH, HEIGHT), "")

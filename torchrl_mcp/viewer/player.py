@@ -1,4 +1,4 @@
-"""The player that viewers share: a policy in one simulation, step by step."""
+"""The player of all viewers, which lets a policy act in one simulation, step by step."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from torchrl_mcp.viewer.scenery import extent, scenery
 
 
 class Weights(NamedTuple):
-    """The weight of each primitive.
+    """The weights of all primitives.
 
     Args:
         title: Kind of weights, ``gates`` or ``option``.
@@ -28,23 +28,24 @@ class Weights(NamedTuple):
 
 
 class Player:
-    """A policy playing the first of a batch of simulations, episode after episode.
+    """A policy that acts in a batch of environments, episode after episode; viewers show the first environment.
 
     Args:
         policy: From the environment's observations to ``action``, on the CPU.
         env: Environments.
-        deterministic: Play the deterministic action rather than a sample.
+        deterministic: Play the deterministic action instead of a sample.
         num_options: Number of options of the policy, 0 without options.
-        aside: Distance of a ghost from the character, in extents of the character.
+        aside: Distance of a ghost from the character, as a multiple of the character's extent.
         before_step: Called before each step, for example to load a newer checkpoint.
 
     Attributes:
         env: The environments without transforms.
-        simulated: Whether the environments are simulations of MuJoCo; others draw themselves.
+        simulated: Whether the environments are MuJoCo simulations of this library; other environments render
+            themselves.
         extent: Largest distance of the character from its centre of mass, in metres.
         began: Whether an episode has just begun.
         state: Current observations of the environment.
-        pinned: Weights of primitives, by number from 0, that replace those of the gate.
+        pinned: Weights that replace the gate's, by the number of the primitive, from 0.
     """
 
     def __init__(
@@ -83,17 +84,17 @@ class Player:
         with set_exploration_type(self._exploration):
             self._decision = self._policy(self.state.select(*self._policy.in_keys))
             if self.pinned and self.has_gates:
-                self._compose_anew()
+                self._compose_pinned()
         step, self.state = self._transformed.step_and_maybe_reset(self.state.update(self._decision))
         self.began = bool(step["next", "done"][0])
 
     @property
     def has_gates(self) -> bool:
-        """Whether the policy ends with a composition of primitives by gates, which can be pinned."""
+        """Whether the policy composes primitives by gates, which can be pinned."""
         return isinstance(self._policy, TensorDictSequential) and "gates" in self._policy[-1].in_keys
 
-    def _compose_anew(self) -> None:
-        """Compose the primitives again, with pinned gates."""
+    def _compose_pinned(self) -> None:
+        """Compose the primitives again, with the pinned gates."""
         for primitive, weight in self.pinned.items():
             self._decision["gates"][..., primitive] = weight
         self._decision = self._policy[-1](self._decision)
@@ -105,7 +106,7 @@ class Player:
 
     @property
     def weights(self) -> Weights | None:
-        """Gates of the last step, or 1 for the option that acted and 0 for the others; None without either."""
+        """Gates of the last step, or 1 for the active option and 0 for the others; None without gates and options."""
         if "gates" in self._decision:
             return Weights("gates", self._decision["gates"][0].tolist())
         if self._num_options and "option" in self._decision:
@@ -115,7 +116,7 @@ class Player:
 
     @property
     def data(self) -> mujoco.MjData:
-        """Current state of the simulation; the next step may overwrite it."""
+        """Current state of the first simulation, which the next step may overwrite."""
         return self.env.simulation.data(0)
 
     @property

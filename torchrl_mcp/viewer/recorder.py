@@ -1,4 +1,4 @@
-"""Films, weights of primitives and learning curves during training, in the run's folder and logger."""
+"""Records films, weights of primitives and learning curves during training."""
 
 import copy
 import math
@@ -24,25 +24,28 @@ from torchrl_mcp.viewer.film import save_film
 from torchrl_mcp.viewer.player import Player, Weights
 
 FOLDER = "recordings"
-"""Subfolder of a run folder."""
+"""Subfolder of a run folder for recordings."""
 
 
 class Recorder:
-    """Saves a film, the weights of primitives in it, and the learning curve, every ``interval`` iterations.
+    """Saves a film, the weights of the primitives in the film, and the learning curve, every ``interval`` iterations.
 
-    It is called in every iteration like a logger. It uses none of the run's random numbers, so that a run is the same
-    with and without it.
+    Training calls a recorder in every iteration, like a logger. Recorders use none of the run's random numbers, so that
+    a run gives the same numbers with and without recordings.
 
     Args:
-        folder: The run folder; pictures go into its ``recordings/``.
+        folder: The run folder; pictures go into its subfolder ``recordings/``.
         policy: The policy in training.
-        make_env: Makes an environment to play in.
-        loggers: TorchRL loggers; TensorBoard, W&B and MLflow show the pictures as well.
+        make_env: Makes the environment in which the policy plays.
+        loggers: TorchRL loggers; TensorBoard, W&B and MLflow also receive the pictures.
         num_options: Number of options of the policy, 0 without options.
         interval: Iterations between recordings.
-        seconds: Length of the film in seconds.
+        seconds: Duration of the film in seconds.
         width: Width of the film in pixels.
         height: Height of the film in pixels.
+
+    Raises:
+        ValueError: If ``interval`` is less than 1.
     """
 
     def __init__(
@@ -67,13 +70,14 @@ class Recorder:
         self._num_options = num_options
         self._interval = interval
         self._seconds = seconds
-        self._width, self._height = width, height
+        self._width = width
+        self._height = height
 
     def log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
-        """Record, if a recording is due.
+        """Save a recording if one is due.
 
         Args:
-            metrics: Metrics of an iteration, with its number as ``iteration``.
+            metrics: Metrics of an iteration, including its number as ``iteration``.
             step: Environment steps so far.
         """
         if metrics["iteration"] % self._interval:
@@ -86,11 +90,11 @@ class Recorder:
     def _record(self, step: int) -> Iterator[tuple[str, Path]]:
         """Write each picture, and yield its name and file."""
         policy = copy.deepcopy(self._policy).cpu()
-        (self._folder / FOLDER).mkdir(exist_ok=True)
-        film, gates, curve = (
-            self._folder / FOLDER / f"{name}-{step:012d}{suffix}"
-            for name, suffix in (("film", ".gif"), ("gates", ".png"), ("curve", ".png"))
-        )
+        recordings = self._folder / FOLDER
+        recordings.mkdir(exist_ok=True)
+        film = recordings / f"film-{step:012d}.gif"
+        gates = recordings / f"gates-{step:012d}.png"
+        curve = recordings / f"curve-{step:012d}.png"
         try:
             save_film(
                 policy,
@@ -102,7 +106,7 @@ class Recorder:
                 num_options=self._num_options,
             )
             yield "film", film
-        except RuntimeError as error:  # no OpenGL; weights and curves do not need it
+        except RuntimeError as error:  # without OpenGL, weights and curves can still be drawn
             warnings.warn(f"no film: {error}", stacklevel=2)
         if figure := self._weights(policy):
             figure.savefig(gates, dpi=100)
@@ -112,13 +116,13 @@ class Recorder:
             yield "curve", curve
 
     def _weights(self, policy: TensorDictModuleBase) -> Figure | None:
-        """Draw the weights of the primitives over the time of the film, if the policy has any."""
+        """Draw the weights of the primitives during the film, or return None for a policy without weights."""
         player = Player(policy, self._make_env(), num_options=self._num_options)
-        found: list[Weights | None] = []
+        weights_of_steps: list[Weights | None] = []
         for _ in range(round(self._seconds / player.env.control_timestep)):
             player.step()
-            found.append(player.weights)
-        values = [weights.values for weights in found if weights is not None]
+            weights_of_steps.append(player.weights)
+        values = [weights.values for weights in weights_of_steps if weights is not None]
         return draw_weights(torch.tensor(values), player.env.control_timestep) if values else None
 
 
@@ -141,9 +145,15 @@ def draw_weights(values: torch.Tensor, timestep: float) -> Figure:
 
 
 def show(logger: Logger, name: str, path: Path, step: int) -> None:
-    """Show a picture or an animated GIF in a logger.
+    """Send a picture or an animated GIF to a logger.
 
-    TorchRL's ``log_video`` would need further libraries to encode tensors as films.
+    TorchRL's ``log_video`` would need further libraries, because it encodes tensors as films.
+
+    Args:
+        logger: The logger; loggers other than TensorBoard, W&B and MLflow are ignored.
+        name: Name of the picture.
+        path: The file, ``.png`` or ``.gif``.
+        step: Environment steps so far.
     """
     if isinstance(logger, TensorboardLogger):
         from tensorboard.compat.proto.summary_pb2 import Summary

@@ -1,4 +1,4 @@
-"""Shapes that explain a task: arrows to targets, and the reference as a ghost."""
+"""Shapes that explain a task, such as arrows to targets and a ghost of the reference motion, and soft light."""
 
 import copy
 
@@ -12,22 +12,23 @@ from torchrl_mcp.envs.rendering.camera import Colour, Shape, arrow, ghost
 from torchrl_mcp.envs.tasks.imitation import Imitation
 
 HAZE: Colour = (0.87, 0.90, 0.94, 1.0)
-"""Colour of the haze on the ground."""
+"""Colour of the haze at the horizon."""
 
 ZENITH: Colour = (0.45, 0.62, 0.82, 1.0)
-"""Colour of the sky above."""
+"""Colour of the sky at the zenith."""
 
 GROUND = (150, 205)
 """Darkest and lightest pixel of the ground, from 0 to 255."""
 
 
 def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Shape]:
-    """Return the shapes to draw in addition to one of the simulations.
+    """Return the shapes that are drawn in addition to a simulation.
 
     Args:
         env: The environments.
-        index: The simulation.
-        aside: Metres by which a ghost is moved along y, so as not to cover the character; 0 for its true place.
+        index: Number of the simulation.
+        aside: Metres by which a ghost is moved along y, so that it does not cover the character; 0 shows the ghost at
+            its true place.
     """
     shapes = [arrow(*ends) for ends in env.arrows(index)]
     if isinstance(env, Imitation):
@@ -38,20 +39,22 @@ def scenery(env: CharacterEnv, index: int = 0, *, aside: float = 0.0) -> list[Sh
 
 
 def reference(env: Imitation, index: int = 0) -> Tensor:
-    """Current state of the reference of one of the simulations, ``(nq,)``."""
-    clip, time, turn, shift = (env.episode[key][index : index + 1] for key in ("clip", "time", "turn", "shift"))
-    return env.library.at(clip, time, Placement(turn, shift)).qpos[0]
+    """Return the current state ``qpos`` of the reference motion of simulation ``index``, ``(nq,)``."""
+    episode = env.episode
+    one = slice(index, index + 1)
+    placement = Placement(episode["turn"][one], episode["shift"][one])
+    return env.library.at(episode["clip"][one], episode["time"][one], placement).qpos[0]
 
 
 def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour = ZENITH) -> mujoco.MjModel:
     """Return a copy of a scene in soft light, with a pale, matt ground that fades into :data:`HAZE`.
 
-    The haze is drawn if a scene's flag ``mjRND_FOG`` is set.
+    MuJoCo draws the haze only if the flag ``mjRND_FOG`` is set.
 
     Args:
         model: The scene.
-        horizon: Colour of the sky, if there is one, at the horizon and below.
-        zenith: Colour of the sky above.
+        horizon: Colour of the sky at the horizon and below, if the scene has a sky.
+        zenith: Colour of the sky at the zenith.
     """
     model = copy.copy(model)
     light = model.vis.headlight
@@ -62,7 +65,7 @@ def softly_lit(model: mujoco.MjModel, *, horizon: Colour = HAZE, zenith: Colour 
     model.light_specular[:] = 0.1
     model.vis.rgba.fog = HAZE
     model.vis.map.fogstart, model.vis.map.fogend = np.array([5.0, 15.0]) / model.stat.extent
-    model.vis.map.shadowclip = 35.0 / model.stat.extent  # beyond the shadow map the ground is speckled
+    model.vis.map.shadowclip = 35.0 / model.stat.extent  # the ground looks speckled beyond the shadow map
     model.mat_reflectance[:] = 0
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).tolist():
         _extend(model, plane)
@@ -96,7 +99,7 @@ def extent(model: mujoco.MjModel) -> float:
 
 
 def _extend(model: mujoco.MjModel, plane: int) -> None:
-    """Make a plane infinite with the same pattern: on large finite planes, MuJoCo draws haze as if they were far."""
+    """Make a plane infinite and keep its pattern, because MuJoCo draws too much haze on large finite planes."""
     size = model.geom_size[plane, :2]
     material = model.geom_matid[plane]
     if material >= 0 and (size > 0).all() and not model.mat_texuniform[material]:
@@ -115,6 +118,6 @@ def _fade(model: mujoco.MjModel, plane: int) -> None:
 
 
 def _pixels(model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """Return the pixels of a texture, a one-dimensional live view."""
+    """Return the pixels of a texture as a one-dimensional view, through which they can be changed."""
     size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
     return model.tex_data[model.tex_adr[texture] :][:size]

@@ -1,4 +1,4 @@
-"""MuJoCo Studio, which MuJoCo 4 has as ``mujoco.studio`` and MuJoCo 3.17 has among its experiments."""
+"""Imports MuJoCo Studio, which is ``mujoco.studio`` in MuJoCo 4 and part of ``mujoco.experimental`` in MuJoCo 3.17."""
 
 try:
     from mujoco.studio import launch_web, messages, plugin, sim, ux, viewer_protocol, web_viewer

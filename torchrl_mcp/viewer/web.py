@@ -1,4 +1,4 @@
-"""MuJoCo Studio's web viewer with ghosts, arrows and a panel for steering."""
+"""MuJoCo Studio's web viewer, extended by ghosts, arrows and a panel for steering."""
 
 import time
 from dataclasses import dataclass
@@ -26,10 +26,13 @@ from torchrl_mcp.viewer.studio import (
 )
 
 FURTHER = 1.4
-"""Factor on the camera's distance in films: a notice of Studio covers the upper part of the page."""
+"""Factor on the distance of the camera in films, because a notice of Studio covers the upper part of the page."""
 
-HORIZON, ZENITH = (0.45, 0.78, 1.0, 1.0), (0.25, 0.55, 1.0, 1.0)
-"""Colours of the sky, which Studio draws at a quarter of their brightness: the haze of films would look grey."""
+HORIZON = (0.45, 0.78, 1.0, 1.0)
+"""Colour of the sky at the horizon. Studio draws the sky at a quarter of its brightness, so haze would look grey."""
+
+ZENITH = (0.25, 0.55, 1.0, 1.0)
+"""Colour of the sky at the zenith."""
 
 KEYS: dict[imgui.Key, Command] = {
     imgui.Key.LeftArrow: lambda steering: steering.turn(TURN),
@@ -42,7 +45,7 @@ KEYS: dict[imgui.Key, Command] = {
 
 @dataclass(frozen=True)
 class BrowserEvent(messages.Event):
-    """A user's command from the browser to the simulation's thread.
+    """Carries a user's command from the browser to the simulation's thread.
 
     Args:
         command: The command.
@@ -52,17 +55,18 @@ class BrowserEvent(messages.Event):
 
 
 class StudioApp(App):
-    """MuJoCo Studio's interface with the panel, and a camera that follows the character.
+    """MuJoCo Studio's interface with the panel, and with a camera that follows the character.
+
+    The viewer's thread reads the attributes and the steering. Other threads must therefore replace the attributes and
+    not change them in place.
+
+    Args:
+        steering: Current steering, which is only read.
+        distance: Distance of the camera from the character, in metres.
 
     Attributes:
         shapes: Shapes to draw in addition to the simulation.
         weights: Weights of the primitives, or None for no bars.
-
-    The viewer's thread reads these and the steering, so other threads must replace them and not change them in place.
-
-    Args:
-        steering: Current steering, read-only.
-        distance: Distance of the camera from the character, in metres.
     """
 
     def __init__(self, steering: Steering, *, distance: float) -> None:
@@ -74,7 +78,7 @@ class StudioApp(App):
         super().__init__(Config(show_options=False, show_inspector=False))
 
     def align_camera(self) -> None:
-        """Follow the first body below the world, once there is one."""
+        """Follow the first body of the scene, as soon as the scene is loaded."""
         camera = self.viewer.camera
         camera.trackbodyid = 1
         camera.distance = self._distance
@@ -83,7 +87,7 @@ class StudioApp(App):
         self.ux_state.camera_index = ux.set_camera(self.model, camera, following)
 
     def handle_keyboard_events(self) -> None:
-        """Steer with the arrow keys, and stop with Space where a task can; Studio handles the other keys."""
+        """Steer with the arrow keys, and with Space in tasks that can stop; Studio handles the other keys."""
         keys = KEYS | ({imgui.Key.Space: Steering.stop} if self._steering.can_stop else {})
         pressed = [key for key in keys if imgui.IsKeyPressed(key, False)]  # without repeats
         if pressed and not imgui.GetIO().WantCaptureKeyboard:
@@ -93,7 +97,7 @@ class StudioApp(App):
             super().handle_keyboard_events()
 
     def handle_mouse_events(self) -> None:
-        """Drag bodies and place the target; Studio handles the rest."""
+        """Drag bodies and place the target; Studio handles all other input of the mouse."""
         if not self._mouse.handle(self.viewer):
             super().handle_mouse_events()
 
@@ -112,7 +116,7 @@ class StudioApp(App):
 
 
 class Pace(plugin.SimPlugin):
-    """Pause and speed as set by the viewer's controls.
+    """Pause and speed as the viewer's controls set them.
 
     Attributes:
         paused: Whether the simulation is paused.
@@ -151,18 +155,21 @@ class BrowserInput(plugin.SimPlugin):
 
 
 def as_geom(shape: Shape) -> mujoco.MjvGeom:
-    """Convert a shape to Studio's type."""
+    """Convert a shape to the type that Studio draws."""
     geom = mujoco.MjvGeom()
     mujoco.mjv_initGeom(geom, *shape)
     return geom
 
 
 def play_in_browser(player: Player, *, port: int) -> None:
-    """Play until the viewer is closed, at the speed of its controls.
+    """Play until the viewer is closed, at the speed that its controls set.
 
     Args:
         player: The player to show.
-        port: Port of the page, 0 for the first free one from 8080.
+        port: Port of the page; 0 takes the first free port from 8080.
+
+    Raises:
+        RuntimeError: If access to this version of Studio cannot be restricted to this machine.
     """
     steering = Steering(player)
     pace = Pace()
@@ -179,5 +186,5 @@ def play_in_browser(player: Player, *, port: int) -> None:
             app.shapes = player.shapes
             app.weights = player.weights or app.weights
             viewer.sync(model, data)
-            steering.push(data.xfrc_applied)  # of a dragged body
+            steering.push(data.xfrc_applied)  # the force on a dragged body
             time.sleep(max(0.0, due - time.perf_counter()))

@@ -1,4 +1,4 @@
-"""MuJoCo's own window, with ghosts, arrows, the weights of primitives, and keys for steering."""
+"""Shows a policy in MuJoCo's window, with ghosts, arrows, the weights of primitives, and keys for steering."""
 
 import os
 import sys
@@ -19,21 +19,21 @@ from torchrl_mcp.viewer.scenery import softly_lit
 from torchrl_mcp.viewer.steering import SLOWEST, TURN, Steering
 
 LENGTH = 24
-"""Number of strokes for a weight of 1."""
+"""Number of strokes that show a weight of 1."""
 
 SLOWER = 0.5
 """Factor on the speed for each press of the slower key."""
 
 
 class Keyboard:
-    """Keys of the window, which the window's thread reports.
+    """Collects the keys that the window's thread reports, and executes their commands.
+
+    Args:
+        steering: The steering to change.
 
     Attributes:
         paused: Whether the simulation is paused.
         speed: Speed relative to real time.
-
-    Args:
-        steering: The steering to change.
     """
 
     def __init__(self, steering: Steering) -> None:
@@ -46,18 +46,18 @@ class Keyboard:
             265: steering.up,
             264: lambda: steering.up(-1),  # down
             259: steering.reset,  # backspace
-            257: steering.let_go,  # enter
+            257: steering.release_all,  # enter
             ord(" "): steering.stop if steering.can_stop else self._pause,
             ord("-"): lambda: self._pace(SLOWER),
             ord("="): lambda: self._pace(1 / SLOWER),
         }
 
     def press(self, key: int) -> None:
-        """Store a pressed key, by GLFW's number."""
+        """Store a pressed key, by its number in GLFW."""
         self._pressed.put(key)
 
     def execute(self) -> None:
-        """Execute the commands of the keys pressed since the last call."""
+        """Execute the commands of the keys that were pressed since the last call."""
         while True:
             try:
                 command = self._commands.get(self._pressed.get_nowait())
@@ -123,14 +123,14 @@ def apply_mouse(steering: Steering, model: mujoco.MjModel, data: mujoco.MjData, 
     """
     if mouse.select == 0 and mouse.localpos.any():
         steering.put(mouse.localpos)
-        mouse.localpos[:] = 0  # only once
+        mouse.localpos[:] = 0  # place the target only once per selection
     data.xfrc_applied[:] = 0
     mujoco.mjv_applyPerturbForce(model, data, mouse)
     steering.push(np.array(data.xfrc_applied))
 
 
 def require_display() -> None:
-    """Check that there is a display: MuJoCo would wait for a window forever.
+    """Check that there is a display, because MuJoCo would wait for a window forever.
 
     Raises:
         RuntimeError: If there is no display.
@@ -138,9 +138,9 @@ def require_display() -> None:
     names = [f"{name}={os.environ[name]}" for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
     if sys.platform != "linux" or (names and _opens()):
         return
-    problem = f"none opens ({', '.join(names)})" if names else "neither DISPLAY nor WAYLAND_DISPLAY names one"
+    problem = f"{', '.join(names)} cannot be opened" if names else "neither DISPLAY nor WAYLAND_DISPLAY is set"
     raise RuntimeError(
-        f"a window needs a display, and {problem}: watch in a browser with --viewer web, or make a film with "
+        f"a window needs a display, but {problem}: watch in a browser with --viewer web, or make a film with "
         "--output film.gif"
     )
 
@@ -153,7 +153,7 @@ def _opens() -> bool:
 
 
 def as_text(weights: Weights) -> tuple[str, str]:
-    """Return two columns of text: title and numbers of the primitives, and their weights as strokes."""
+    """Return two columns of text: the title with the numbers of the primitives, and the weights as strokes."""
     numbers = [str(number + 1) for number in range(len(weights.values))]
     strokes = ["|" * round(LENGTH * value) for value in weights.values]
     return "\n".join([weights.title, *numbers]), "\n".join(["", *strokes])

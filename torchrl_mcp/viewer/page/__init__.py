@@ -1,1 +1,1 @@
-"""A policy as a web page that runs in the reader's browser: physics, networks and pictures."""
+"""Writes a policy as a web page, on which the reader's browser computes physics, networks and pictures."""

@@ -1,4 +1,4 @@
-// Compile a scene with the browser's MuJoCo, and print its version and what the model holds, or the error, as JSON.
+// Compile a scene with the browser's MuJoCo, and print MuJoCo's version and the fields of the model, or the error, as JSON.
 //   node check.mjs RUNTIMES < scene.xml
 
 import fs from "node:fs";

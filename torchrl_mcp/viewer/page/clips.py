@@ -1,4 +1,4 @@
-"""Reference motions as arrays, which the page plays."""
+"""Writes reference motions as arrays, which the page plays."""
 
 from itertools import islice
 from pathlib import Path
@@ -11,27 +11,28 @@ from torchrl_mcp.envs.tasks.imitation import NUM_TARGETS
 from torchrl_mcp.training.run_folder import replacing
 
 MOST = 16
-"""Number of clips on a page."""
+"""Largest number of clips on a page."""
 
 SECONDS = 10.0
-"""Longest part of a clip on a page, as long as an episode of imitation."""
+"""Longest part of a clip on a page, which is as long as an episode of imitation."""
 
 
 def write_clips(env: Imitation, folder: Path, prefix: str) -> list[dict[str, Any]]:
-    """Write the first clips of an environment, and return the name of each and what JavaScript must know of it.
+    """Write the first clips of an environment, and return the name of each clip and its description for JavaScript.
 
-    A file holds float32 numbers, ``(T, L, 13)``: at each of T control steps, position, orientation, linear and angular
-    velocity of the character's L bodies in the world.
+    A file contains float32 numbers, ``(T, L, 13)``: at each of T control steps, position, orientation, linear and
+    angular velocity of the character's L bodies in the world.
 
     Args:
         env: The environment.
         folder: The folder to write.
-        prefix: Beginning of the names of the files.
+        prefix: Prefix of the names of the files.
     """
     library = env.library
     described = []
     for index, name in enumerate(islice(library.names, MOST)):
-        loops, duration = bool(library.loops[index]), float(library.durations[index])
+        loops = bool(library.loops[index])
+        duration = float(library.durations[index])
         num_steps = round((SECONDS if loops else min(SECONDS, duration)) / env.control_timestep) + NUM_TARGETS
         times = env.control_timestep * torch.arange(num_steps, dtype=torch.float64)
         motion = library.at(torch.full((num_steps,), index), times)

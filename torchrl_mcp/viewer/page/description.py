@@ -1,4 +1,4 @@
-"""What JavaScript must know of a policy and its environment, and which of these it can play."""
+"""Describes policies and their environments to JavaScript, and checks that JavaScript can play them."""
 
 import json
 from typing import Any
@@ -11,33 +11,35 @@ from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.runs.interface import interface
 
 TASKS = (Heading, Location, Carry, Dribble, Imitation)
-"""Tasks that ``tasks.js`` has."""
+"""Tasks that ``tasks.js`` implements."""
 
 SHAPES = tuple(f"mjGEOM_{shape}" for shape in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"))
-"""Shapes that ``drawing.js`` has."""
+"""Shapes that ``drawing.js`` can draw."""
 
 
 def require_playable(env: CharacterEnv) -> PDCharacterEnv:
-    """Return an environment whose task and character JavaScript knows.
+    """Return the environment, after checking that the page can play its task and draw its character.
 
     Raises:
-        ValueError: If it does not know them.
+        ValueError: If the page cannot play the task, or cannot draw a shape of the character.
     """
-    able = ", ".join(task.__name__.lower() for task in TASKS)
+    playable = ", ".join(task.__name__.lower() for task in TASKS)
     name = type(env).__name__
     if type(env) not in TASKS or not isinstance(env, PDCharacterEnv):
-        raise ValueError(f"the page does not know the task {name}: export a gate for {able}")
+        raise ValueError(f"the page cannot play the task {name}: export a gate for {playable}")
     model = env.simulation.model
     shapes = {mujoco.mjtGeom(shape).name for shape in model.geom_type}
-    if others := sorted(shapes - set(SHAPES)):
-        raise ValueError(f"the page cannot draw the shapes {', '.join(others)} of {env.character.name}: remove them")
+    if unknown := sorted(shapes - set(SHAPES)):
+        raise ValueError(
+            f"the page cannot draw the shapes {', '.join(unknown)} of {env.character.name}: remove these geoms"
+        )
     return env
 
 
 def character(env: PDCharacterEnv) -> dict[str, Any]:
-    """Return what all gates of a character share."""
+    """Return the numbers that all gates of a character share."""
     return {
-        "num_bodies": len(env.observation_layout) // 4,  # four quantities for each, after the root's height
+        "num_bodies": len(env.observation_layout) // 4,  # four quantities per body, after the height of the root
         "num_qpos": len(env.initial_states.rest),
         "num_qvel": env.initial_states.num_velocities,
         "physics_timestep": env.simulation.model.opt.timestep,
@@ -47,7 +49,7 @@ def character(env: PDCharacterEnv) -> dict[str, Any]:
 
 
 def gate(env: PDCharacterEnv) -> dict[str, Any]:
-    """Return what the task of a gate shows it, and the range of its speeds in m/s."""
+    """Return the description of a gate's task: the contents of its goal, and the range of its speeds in m/s."""
     if isinstance(env, Imitation):
         return {"task": "Imitation"}
     described: dict[str, Any] = {"task": type(env).__name__, "goal": list(env.goal_layout), "waypoint": False}

@@ -1,4 +1,4 @@
-"""A page as a folder of static files."""
+"""Writes a page as a folder of static files."""
 
 import shutil
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from torchrl_mcp.viewer.page.runtimes import NOTICES, runtimes
 from torchrl_mcp.viewer.page.scene import for_browser, require_same_model
 
 ABOUT = "page.json"
-"""File that describes the policy to JavaScript; it is written last."""
+"""File that describes the policy to JavaScript; it is written after all other files."""
 
 Player = tuple[TensorDictModuleBase, CharacterEnv | TransformedCharacterEnv]
 """A policy and its environment."""
@@ -28,15 +28,15 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
     """Write a page on which a character follows one of several gates over the same primitives.
 
     Args:
-        players: Policies by the names of their gates; the page begins with the first.
-        folder: The folder to write; its other files remain.
+        players: Policies by the names of their gates; the page begins with the first gate.
+        folder: The folder to write; other files in the folder remain.
         title: Title of the page.
         command: Command that makes the page.
         half: Store the networks in half precision.
 
     Raises:
-        ValueError: If a task or character is unknown to the page, primitives differ, the browser's MuJoCo refuses a
-            scene, or the runtimes cannot be fetched.
+        ValueError: If the page cannot play a task or draw a character, the primitives differ, the browser's MuJoCo
+            compiles a scene differently, or the runtimes cannot be fetched.
     """
     require_onnx(folder)
     envs = [description.require_playable(env) for _, env in players.values()]
@@ -55,7 +55,7 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
         names = {"primitives": "primitives.onnx", "gate": files["network"], "mixer": "mixer.onnx"}
         state = env.reset()[:1].select("observation", "goal")
         for part, stage in policy.items():
-            if part == "gate" or index == 0:  # the others are the same for all gates
+            if part == "gate" or index == 0:  # all gates share primitives and mixer
                 write_stage(stage, state, folder / names[part], half=half)
             stage.evaluate(state)
         gate = {"name": name, **files, **description.gate(env)}
@@ -66,7 +66,7 @@ def write_page(players: Mapping[str, Player], folder: Path, *, title: str, comma
 
 
 def _copy(libraries: Path, folder: Path) -> None:
-    """Copy page and runtimes to a folder."""
+    """Copy the page and the runtimes to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     with resources.as_file(resources.files(__package__) / "static") as page:
         shutil.copytree(page, folder, dirs_exist_ok=True)

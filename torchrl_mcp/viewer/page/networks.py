@@ -1,4 +1,4 @@
-"""Primitives, gates and mixer of a policy as ONNX files of their own, with weights in half precision."""
+"""Writes primitives, gates and mixer of a policy as separate ONNX files, with weights in half precision."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,19 +15,19 @@ from torchrl_mcp.methods.actor import PRIMITIVES, STATE
 from torchrl_mcp.runs.onnx_files import write_program
 
 LARGE = 1000
-"""Number of weights from which a parameter is stored in half precision."""
+"""Parameters with at least this number of weights are stored in half precision."""
 
 NAMES = {STATE: "state", PRIMITIVES[0]: "loc", PRIMITIVES[1]: "scale"}
-"""Names in the files of keys that are no names themselves."""
+"""Names that the files use for nested keys."""
 
 
 class Stage(nn.Module):
-    """A part of a policy as a function of plain tensors, for its deterministic action.
+    """A part of a policy as a function of plain tensors, for the deterministic action.
 
     Args:
         module: Part of the policy.
-        in_keys: Keys that it reads, the arguments of the function.
-        out_keys: Keys that it writes, its results.
+        in_keys: Keys that the part reads: the arguments of the function.
+        out_keys: Keys that the part writes: the results of the function.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Stage(nn.Module):
 
     @torch.no_grad()
     def evaluate(self, state: TensorDictBase) -> None:
-        """Add the results to a state that has the arguments."""
+        """Add the results to a state that contains the arguments."""
         state.update(dict(zip(self.out_keys, self(*(state[key] for key in self.in_keys)), strict=True)))
 
 
@@ -61,7 +61,7 @@ def stages(policy: TensorDictModuleBase) -> dict[str, Stage]:
         ValueError: If the policy has no gate over primitives.
     """
     if not isinstance(policy, TensorDictSequential) or "gates" not in policy[-1].in_keys:
-        raise ValueError("the policy composes no primitives by gates, which the page shows: export one of method=mcp")
+        raise ValueError("the page needs a policy that composes primitives by gates: export one of method=mcp")
     primitives = policy.select_subsequence(in_keys=["observation"], out_keys=[*PRIMITIVES])
     gate = policy.select_subsequence(in_keys=[STATE, "goal"], out_keys=["gates"])
     return {
@@ -75,36 +75,38 @@ def require_same_primitives(policies: Sequence[Mapping[str, Stage]]) -> None:
     """Check that policies have the same primitives.
 
     Args:
-        policies: The :func:`stages` of each.
+        policies: The :func:`stages` of each policy.
 
     Raises:
         ValueError: If the primitives or the normalisation of the state differ.
     """
-    first, *others = (policy["primitives"].state_dict() for policy in policies)
-    for number, other in enumerate(others, 2):
-        if first.keys() != other.keys() or any(not torch.equal(first[key], other[key]) for key in first):
-            raise ValueError(f"gate {number} has other primitives than gate 1: give gates over the same primitives")
+    first = policies[0]["primitives"].state_dict()
+    for number, policy in enumerate(policies[1:], 2):
+        state = policy["primitives"].state_dict()
+        if first.keys() != state.keys() or any(not torch.equal(first[key], state[key]) for key in first):
+            raise ValueError(f"gate {number} has different primitives than gate 1: give gates over the same primitives")
 
 
 def write_stage(stage: Stage, example: TensorDictBase, path: Path, *, half: bool = True) -> None:
-    """Write a part of a policy as ONNX, for one state at a time.
+    """Write a part of a policy as an ONNX file for one state at a time.
 
     Args:
         stage: The part.
-        example: Its arguments by key, batch size 1.
+        example: Arguments of the part by key, batch size 1.
         path: The file to write.
         half: Store large parameters in half precision; the arithmetic remains in single precision.
     """
-    inputs = tuple(example[key] for key in stage.in_keys)
+    arguments = tuple(example[key] for key in stage.in_keys)
     with torch.no_grad():
-        program = torch.export.export(stage, inputs)
-    names = [[NAMES.get(key, key) for key in keys] for keys in (stage.in_keys, stage.out_keys)]
+        program = torch.export.export(stage, arguments)
+    inputs = [NAMES.get(key, key) for key in stage.in_keys]
+    outputs = [NAMES.get(key, key) for key in stage.out_keys]
     edit = halve if half else lambda model: None
-    write_program(program, path, inputs=names[0], outputs=names[1], edit=edit)
+    write_program(program, path, inputs=inputs, outputs=outputs, edit=edit)
 
 
 def halve(model: Any) -> None:
-    """Store the large parameters of an ONNX model in half precision, and cast them back where they are used."""
+    """Store the large parameters of an ONNX model in half precision, and cast them to single precision before use."""
     import onnx
     from onnx import numpy_helper
 

@@ -1,4 +1,4 @@
-"""The page's runtimes: MuJoCo, ONNX Runtime and three.js for browsers, of pinned npm packages."""
+"""Fetches the runtimes of the page: MuJoCo, ONNX Runtime and three.js for browsers, from pinned npm packages."""
 
 import gzip
 import hashlib
@@ -26,16 +26,17 @@ FILES: Mapping[str, str] = MappingProxyType(
         "OrbitControls.js": "three/examples/jsm/controls/OrbitControls.js",
     }
 )
-"""Files of the packages by their names in the page; those that end with ``.gz`` are compressed."""
+"""Files of the packages by their names on the page; names with ``.gz`` stand for compressed files."""
 
 LICENSES: Mapping[str, str] = MappingProxyType({"@mujoco/mujoco": "mujoco", "onnxruntime-web": "onnxruntime"})
-"""Python packages of the same projects: their npm packages lack the texts of the licences."""
+"""npm packages without the text of their licence, and the Python packages of the same projects that contain it."""
 
 NOTICES = "LICENSES.txt"
+"""File with the licences of all packages."""
 
 
 def runtimes() -> Path:
-    """Return the folder of the runtimes; they are fetched with npm where that has not happened before.
+    """Return the folder of the runtimes in the user's cache, to which npm fetches them if necessary.
 
     Raises:
         ValueError: If npm is missing or cannot fetch the packages.
@@ -57,19 +58,19 @@ def require_npm() -> str:
     """Return the path of npm.
 
     Raises:
-        ValueError: If it is not installed.
+        ValueError: If npm or Node.js is not installed.
     """
     npm = shutil.which("npm")
     if npm is None or shutil.which("node") is None:
         raise ValueError(
-            "a page needs npm, which fetches MuJoCo, ONNX Runtime and three.js for browsers: install Node.js 18 or "
-            "newer (Debian: apt install npm) and repeat the command"
+            "writing a page needs npm, which fetches MuJoCo, ONNX Runtime and three.js for browsers: install Node.js "
+            "18 or newer (Debian: apt install npm) and repeat the command"
         )
     return npm
 
 
 def _fetch(folder: Path) -> Path:
-    """Install the pinned packages below a folder, and return where they are.
+    """Install the pinned packages below a folder, and return the folder of the packages.
 
     Raises:
         ValueError: If npm is missing or fails.
@@ -84,26 +85,26 @@ def _fetch(folder: Path) -> Path:
         reason = next(iter(done.stderr.strip().splitlines()), f"exit code {done.returncode}")
         raise ValueError(
             f"npm cannot fetch the packages of the page ({reason}): repeat the command with a connection to npm's "
-            "registry; later pages need none"
+            "registry, which only the first page needs"
         )
     return folder / "node_modules"
 
 
 def _collect(packages: Path, folder: Path) -> None:
-    """Copy the files of the page and the licences to a folder."""
+    """Copy the runtimes and their licences from the packages to a folder."""
     folder.mkdir()
     for name, source in FILES.items():
         if name.endswith(".gz"):
             (folder / name).write_bytes(gzip.compress((packages / source).read_bytes(), mtime=0))
         else:
             shutil.copy(packages / source, folder / name)
-    shutil.copy(packages.parent / "package.json", folder)  # with the versions, and for node the kind of modules
+    shutil.copy(packages.parent / "package.json", folder)  # gives the versions, and tells node the kind of modules
     names = dict.fromkeys("/".join(source.split("/")[: 2 if source[0] == "@" else 1]) for source in FILES.values())
     (folder / NOTICES).write_text("\n\n".join(_license(packages / name, name) for name in names), encoding="utf-8")
 
 
 def _license(package: Path, name: str) -> str:
-    """Return version, licence and notices of a package."""
+    """Return the version, the licence and the notices of a package."""
     about = json.loads((package / "package.json").read_text(encoding="utf-8"))
     texts = [path.read_text(encoding="utf-8") for path in sorted(package.glob("LICENSE*"))]
     if not texts:
@@ -112,7 +113,7 @@ def _license(package: Path, name: str) -> str:
 
 
 def _notices(distribution: str) -> list[Path]:
-    """Return the files with the licences of an installed Python package."""
+    """Return the files with licences of an installed Python package, or none if it is not installed."""
     try:
         listed = files(distribution) or []
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Scenes for the browser's MuJoCo, which is older than Python's."""
+"""Prepares scenes for the browser's MuJoCo, which is older than Python's MuJoCo, and checks them."""
 
 import json
 import subprocess
@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 TOLERANCE = 1e-5
-"""Largest relative difference of a model's numbers: MJCF has six digits."""
+"""Largest absolute or relative difference between numbers of two models, because MJCF has six digits."""
 
 
 def for_browser(scene: str) -> str:
-    """Return the MJCF of a scene without what MuJoCo 3.17 writes and 3.14 refuses: ``input="pos"``, its default."""
+    """Return the MJCF of a scene without ``input="pos"``, the default that MuJoCo 3.17 writes and 3.14 refuses."""
     root = ElementTree.fromstring(scene)
     for actuator in root.iter("general"):
         if actuator.get("input") == "pos":
@@ -24,24 +24,24 @@ def for_browser(scene: str) -> str:
 
 
 def require_same_model(scene: str, model: mujoco.MjModel, runtimes: Path) -> str:
-    """Check that the browser's MuJoCo compiles a scene to the model of Python's, and return its version.
+    """Check that the browser's MuJoCo compiles a scene to the same model as Python's, and return its version.
 
     Args:
         scene: MJCF for the browser.
-        model: Python's model of the scene.
-        runtimes: The runtimes of the page.
+        model: The model that Python's MuJoCo compiles from the scene.
+        runtimes: The folder of the page's runtimes.
 
     Raises:
-        ValueError: If the scene does not compile, with MuJoCo's reason, or the models differ, with the fields.
+        ValueError: If the scene does not compile or the models differ; the message names the reason or the fields.
     """
     report = _report(scene, runtimes)
-    names = f"MuJoCo {report['version']} of the browser"
+    browser = f"the browser's MuJoCo {report['version']}"
     if "error" in report:
-        raise ValueError(f"{names} does not compile the scene: {' '.join(report['error'].split())}")
+        raise ValueError(f"{browser} cannot compile the scene: {' '.join(report['error'].split())}")
     if different := [name for name, values in report["fields"].items() if not _same(values, getattr(model, name))]:
         raise ValueError(
-            f"{names} compiles the scene to another model than Python's {mujoco.__version__}: {', '.join(different)} "
-            "differ"
+            f"{browser} and Python's MuJoCo {mujoco.__version__} compile the scene to different models: "
+            f"{', '.join(different)} differ"
         )
     return str(report["version"])
 

@@ -1,14 +1,14 @@
-// The scene in the colours of the films: geoms of MuJoCo's compiled model, arrows to targets, and a camera that follows.
+// Draws the scene in the colours of the films: geoms of MuJoCo's model, arrows to targets, with a camera that follows.
 
 import * as three from "three";
 import { OrbitControls } from "./runtimes/OrbitControls.js";
 
-three.ColorManagement.enabled = false; // MuJoCo adds light in the numbers of the screen
-const HAZE = new three.Color(0.87, 0.9, 0.94); // this and what follows: scenery.py and film.py
+three.ColorManagement.enabled = false; // MuJoCo adds light in the colour values of the screen
+const HAZE = new three.Color(0.87, 0.9, 0.94); // the values below are those of scenery.py and film.py
 const ZENITH = new three.Color(0.45, 0.62, 0.82);
 const RED = new three.Color(0.9, 0.1, 0.1);
 const [AZIMUTH, ELEVATION, DISTANCE, LAG] = [(115 * Math.PI) / 180, (-26 * Math.PI) / 180, 2.8, 0.25];
-const [GROUND, PATTERN] = [60, 2]; // widths in metres
+const [GROUND, PATTERN] = [60, 2]; // widths of the ground and of its pattern, in metres
 const Z = new three.Vector3(0, 0, 1);
 
 export class Drawing {
@@ -24,10 +24,10 @@ export class Drawing {
     this.headlight = new three.DirectionalLight("white", 0.35 * Math.PI);
     this.sun = sun();
     this.focus = new three.Vector3();
-    this.ratio = Math.min(devicePixelRatio, 2); // pixels of the picture to those of the page
+    this.ratio = Math.min(devicePixelRatio, 2); // pixels of the picture per pixel of the page
   }
 
-  /** Show a scene; the camera keeps its place if a scene was shown before. */
+  /** Show a scene; the camera stays where it is, except for the first scene. */
   show({ model, data }) {
     const first = !this.model;
     Object.assign(this, { model, data, scene: new three.Scene(), arrows: [] });
@@ -46,7 +46,7 @@ export class Drawing {
     if (first) this.stand();
   }
 
-  /** Look at the character as films do. */
+  /** Place the camera as in films. */
   stand() {
     const [distance, flat] = [DISTANCE * this.extent(), Math.cos(ELEVATION)];
     this.focus.fromArray(this.data.subtree_com, 3);
@@ -58,10 +58,10 @@ export class Drawing {
   /** Largest distance of the character from its centre of mass, in metres. */
   extent() {
     const { model, data } = this;
-    const own = this.geoms.filter(({ geom }) => model.body_rootid[model.geom_bodyid[geom]] === 1);
+    const geoms = this.geoms.filter(({ geom }) => model.body_rootid[model.geom_bodyid[geom]] === 1);
     const centre = new three.Vector3().fromArray(data.subtree_com, 3);
     const place = new three.Vector3();
-    return Math.max(...own.map(({ geom }) => {
+    return Math.max(...geoms.map(({ geom }) => {
       return place.fromArray(data.geom_xpos, 3 * geom).distanceTo(centre) + model.geom_rbound[geom];
     }));
   }
@@ -114,13 +114,13 @@ export class Drawing {
     this.ground?.position.set(nearest(this.focus.x), nearest(this.focus.y), 0);
   }
 
-  /** What is at a place of the picture, both coordinates from -1 to 1: a body of the character, or the ground. */
+  /** The point of the scene at a place of the picture, whose coordinates are from -1 to 1, or null without a hit. */
   pick(x, y) {
     this.picker.setFromCamera(new three.Vector2(x, y), this.camera);
     const [hit] = this.picker.intersectObjects([...this.geoms.map(({ mesh }) => mesh), this.ground]);
     if (!hit) return null;
     const body = this.model.geom_bodyid[hit.object.userData.geom];
-    return { place: hit.point.toArray(), own: body > 0 && this.model.body_rootid[body] === 1 };
+    return { place: hit.point.toArray(), isCharacter: body > 0 && this.model.body_rootid[body] === 1 };
   }
 
   /** Horizontal direction in which the camera looks. */
@@ -130,7 +130,7 @@ export class Drawing {
   }
 }
 
-/** Shapes by MuJoCo's number of their kind, with their axis along z. */
+/** Geometries by the number of MuJoCo's type, with their axis along z. */
 const SHAPES = {
   2: ([radius]) => new three.SphereGeometry(radius, 32, 20),
   3: ([radius, half]) => new three.CapsuleGeometry(radius, 2 * half, 8, 20).rotateX(Math.PI / 2),
@@ -150,14 +150,15 @@ function solid(model, geom) {
   return mesh;
 }
 
-/** Colour and opacity: the geom's, unless it is MuJoCo's default and the material has one. */
+/** Colour and opacity of a geom, or of its material if the geom has MuJoCo's default colour. */
 function rgba(model, geom) {
-  const own = Array.from(model.geom_rgba.subarray(4 * geom, 4 * geom + 4));
+  const colour = Array.from(model.geom_rgba.subarray(4 * geom, 4 * geom + 4));
   const material = model.geom_matid[geom];
-  return material >= 0 && own.join() === "0.5,0.5,0.5,1" ? model.mat_rgba.subarray(4 * material, 4 * material + 4) : own;
+  const isDefault = colour.join() === "0.5,0.5,0.5,1";
+  return material >= 0 && isDefault ? model.mat_rgba.subarray(4 * material, 4 * material + 4) : colour;
 }
 
-/** The first square of the texture of a geom's material, null without one. */
+/** The first square of the texture of a geom's material, or null without a texture. */
 function pattern(model, geom) {
   const material = model.geom_matid[geom];
   const texture = material < 0 ? -1 : model.mat_texid[model.mat_texid.length / model.nmat * material + 1];
@@ -175,7 +176,7 @@ function pattern(model, geom) {
   return map;
 }
 
-/** A sphere with the same picture on six sides, as MuJoCo wraps a cube. */
+/** A sphere with the same picture on six sides, as MuJoCo wraps the texture of a cube. */
 function ball(radius) {
   const shape = new three.BoxGeometry(1, 1, 1, 12, 12, 12);
   const { position, normal } = shape.attributes;
@@ -196,7 +197,7 @@ function ground(model, geom) {
   return Object.assign(mesh, { receiveShadow: true, userData: { geom } });
 }
 
-/** A dome whose colour goes from haze at the horizon to the sky's above. */
+/** A dome whose colour changes from haze at the horizon to the colour of the sky at the zenith. */
 function sky() {
   const dome = new three.SphereGeometry(40, 32, 24).rotateX(Math.PI / 2);
   const heights = dome.attributes.position;
@@ -226,7 +227,7 @@ function arrow() {
   return shape;
 }
 
-/** Let an arrow go from a tail to a tip, and hide it without these. */
+/** Draw an arrow from a tail to a tip, or hide it without ends. */
 function point(shape, ends) {
   const [tail, tip] = (ends ?? [[0, 0, 0], [0, 0, 0]]).map((end) => new three.Vector3(...end));
   const way = tip.clone().sub(tail);

@@ -1,14 +1,16 @@
-// The page: pictures in real time, and what a reader does with keys, pointer and buttons.
+// The page: shows the simulation in real time, and handles keys, pointer and buttons.
 
 import { Drawing } from "./drawing.js";
 import { open } from "./simulation.js";
 
 const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7f7f7f", "#b8860b"];
-const SPEEDS = [1, 0.5, 0.2]; // of time
-const [PUSH_SECONDS, PUSH_SPEED] = [0.15, 0.5]; // a push adds so many m/s to the whole body
-const [SLACK, DEBT, FALLEN_SECONDS] = [6, 0.1, 2]; // pixels of a click; seconds to catch up; until the next episode
-
-const LEAST_PICTURES = 20; // per second: below, after a second, pictures become simpler
+const SPEEDS = [1, 0.5, 0.2]; // relative to real time
+const PUSH_SECONDS = 0.15;
+const PUSH_SPEED = 0.5; // m/s that a push adds to the velocity of the whole body
+const SLACK = 6; // pixels that the pointer may move during a click
+const DEBT = 0.1; // longest time of computation per picture, in seconds
+const FALLEN_SECONDS = 2; // from a fall to the next episode
+const LEAST_PICTURES = 20; // pictures per second below which, after a second, the drawing becomes simpler
 
 const element = (id) => document.getElementById(id);
 
@@ -16,9 +18,9 @@ class Page {
   owed = 0; // seconds of simulation that are due
   pace = 0; // index of SPEEDS
   paused = false;
-  pushed = 0; // seconds of a push that are left
+  pushed = 0; // remaining seconds of a push
   lying = 0; // seconds since a fall
-  few = 0; // times in a row that pictures were few
+  few = 0; // number of successive half seconds with too few pictures
   pictures = { since: performance.now(), count: 0, simulated: 0, wanted: 0 };
 
   constructor(simulation) {
@@ -28,7 +30,8 @@ class Page {
     this.addButtons();
     this.addPointer();
     addEventListener("keydown", (event) => this.press(event));
-    document.addEventListener("visibilitychange", () => (this.last = performance.now())); // what was hidden is not due
+    // Time in a hidden tab does not count as due.
+    document.addEventListener("visibilitychange", () => (this.last = performance.now()));
     new ResizeObserver(([{ contentRect }]) => {
       this.drawing.resize(Math.max(contentRect.width, 1), Math.max(contentRect.height, 1));
     }).observe(element("stage"));
@@ -40,9 +43,9 @@ class Page {
     return this.simulation.scene.task;
   }
 
-  /** Simulate what is due, draw, and wait for the next picture; a page in a hidden tab stands still. */
+  /** Simulate the time since the last picture, draw, and request the next picture; in a hidden tab, do not simulate. */
   async frame(now) {
-    const seconds = Math.min(Math.max(now - this.last, 0) / 1000, 1); // a picture's time may lie before the last event
+    const seconds = Math.min(Math.max(now - this.last, 0) / 1000, 1); // `now` may lie before the last event
     this.last = now;
     if (!this.paused && !document.hidden) await this.simulate(seconds);
     this.drawing.draw(this.task.arrows(), seconds);
@@ -64,11 +67,11 @@ class Page {
       if (this.pushed <= 0) this.simulation.push(0, 0);
       this.lying = this.simulation.fallen ? this.lying + physics_timestep : 0;
     }
-    if (this.owed >= physics_timestep) this.owed = 0; // too slow: what is due is dropped, and said below
+    if (this.owed >= physics_timestep) this.owed = 0; // on slow devices drop the rest, which the status line reports
     if (this.lying > FALLEN_SECONDS) this.reset();
   }
 
-  /** Twice a second, tell frames per second, and whether time is real. */
+  /** Twice a second, show the frames per second, and whether the simulation keeps real time. */
   count(now) {
     const { pictures } = this;
     pictures.count += 1;
@@ -78,7 +81,7 @@ class Page {
     const slow = pace < 0.93 * SPEEDS[this.pace];
     const time = this.paused ? "paused" : pace > 0.93 ? "real time" : `${pace.toFixed(2)} × real time`;
     const reason = !this.paused && slow ? ": this device is too slow" : "";
-    const fall = this.simulation.fallen ? " · fallen, stands up soon" : "";
+    const fall = this.simulation.fallen ? " · fallen, restarts soon" : "";
     element("status").textContent = `${Math.round(pictures.count / seconds)} frames/s · ${time}${reason}${fall}`;
     this.few = pictures.count / seconds < LEAST_PICTURES ? this.few + 1 : 0;
     if (this.few === 2) this.drawing.lighten();
@@ -101,13 +104,13 @@ class Page {
       this.simulation.select(index);
       this.drawing.show(this.simulation.scene);
     }
-    [...element("gates").children].forEach((button, other) => button.setAttribute("aria-pressed", other === index));
+    [...element("gates").children].forEach((button, number) => button.setAttribute("aria-pressed", number === index));
     element("pad").hidden = !this.task.steers;
     for (const id of ["faster", "slower", "stop"]) element(id).hidden = !this.task.paces;
     element("help").textContent = HELP[this.simulation.scene.gate.task];
   }
 
-  /** A bar for each primitive, once their number is known. */
+  /** Show a bar for each primitive; the bars are added after the first step, which gives the number of primitives. */
   showWeights() {
     const { weights, pinned } = this.simulation;
     const bars = element("bars").children;
@@ -148,7 +151,7 @@ class Page {
     for (const [id, action] of Object.entries(actions)) {
       element(id).addEventListener("click", ({ detail, currentTarget }) => {
         action();
-        if (detail) currentTarget.blur(); // keys go to the character again
+        if (detail) currentTarget.blur(); // after a click, keys steer the character again
       });
     }
     this.keys = {
@@ -182,12 +185,12 @@ class Page {
       if (!pressed || Math.hypot(clientX - pressed[0], clientY - pressed[1]) > SLACK) return;
       const { left, top, width, height } = view.getBoundingClientRect();
       const hit = this.drawing.pick((2 * (clientX - left)) / width - 1, 1 - (2 * (clientY - top)) / height);
-      if (hit?.own) this.push();
+      if (hit?.isCharacter) this.push();
       else if (hit) this.task.put(hit.place);
     });
   }
 
-  /** Push the character in the direction in which the reader looks. */
+  /** Push the character in the direction in which the camera looks. */
   push() {
     const { model } = this.simulation.scene;
     const force = (model.body_subtreemass[1] * PUSH_SPEED) / PUSH_SECONDS;
@@ -214,11 +217,11 @@ class Page {
 }
 
 const HELP = {
-  Heading: "Click the ground, or press ← and →: the character turns. ↑ and ↓ change the speed if the gate has others.",
-  Location: "Click the ground: the character goes there. Or lead it with ← → ↑ ↓; Space stops it.",
-  Carry: "Click the ground: the red table moves there, and the character brings the box.",
-  Dribble: "Click the ground: the target moves there, and the character brings the ball.",
-  Imitation: "The character follows a motion, whose place the arrow shows. The buttons choose another one.",
+  Heading: "Click the ground, or press ← and →, to turn the character. ↑ and ↓ change the speed, if it can be changed.",
+  Location: "Click the ground to send the character there, or steer it with ← → ↑ ↓. Space stops the character.",
+  Carry: "Click the ground to move the red table there. The character then brings the box.",
+  Dribble: "Click the ground to move the target there. The character then brings the ball.",
+  Imitation: "The character imitates a motion; the arrow shows where the motion is. The buttons choose another motion.",
 };
 
 const simulation = await open();

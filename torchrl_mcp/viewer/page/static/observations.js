@@ -1,17 +1,17 @@
-// What a policy observes, for one simulation: observations.py, and the goals of envs/tasks, with the same names.
+// Observations of a policy in one simulation, with the names of observations.py and of the goals in envs/tasks.
 // Positions are in metres and angles in radians; quaternions are (w, x, y, z).
 
 export const LINEAR_DISTANCE = 0.25; // places.py
 export const ARRIVAL_DISTANCE = 0.3; // rewards.py
-const WALK_AHEAD = 1.5; // seconds; this and what follows: waypoints.py
+const WALK_AHEAD = 1.5; // seconds; this line and the next are the constants of waypoints.py
 const [STRIDE, PUSH, SHARE, BEHIND, ASIDE, STEP] = [1.0, 0.5, 0.1, 0.7, Math.PI / 4, 0.5];
 const [SUCCESS_DISTANCE, SUCCESS_REACH] = [0.5, 2.0]; // rewards.py
 const HORIZON = 0.25; // seconds, imitation_reward.py
 
-/** Horizontal angle of a body's x axis from the world's. */
+/** Horizontal angle between the x axes of a body and of the world. */
 export const heading = ([w, x, y, z]) => Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z));
 
-/** A vector of three components of an array, the `index`-th. */
+/** The `index`-th vector of an array of vectors with three components. */
 export const vector = (array, index) => [array[3 * index], array[3 * index + 1], array[3 * index + 2]];
 
 export const quaternion = (array, index) => Array.from(array.subarray(4 * index, 4 * index + 4));
@@ -32,7 +32,7 @@ export function in_heading_frame(angle, origin, place, [w, i, j, k], velocity, s
   return [...seen(offset), sign * qw, sign * qx, sign * qy, sign * qz, ...seen(velocity), ...seen(spin)];
 }
 
-/** The same of a body of the scene. */
+/** The same 13 numbers for a body of the scene. */
 export function body_in_heading_frame(angle, origin, model, data, body) {
   const [vx, vy, vz] = [3, 4, 5].map((axis) => data.cvel[6 * body + axis]);
   const spin = [0, 1, 2].map((axis) => data.cvel[6 * body + axis]);
@@ -44,35 +44,35 @@ export function body_in_heading_frame(angle, origin, model, data, body) {
   return in_heading_frame(angle, origin, place, quaternion(data.xquat, body), velocity, spin);
 }
 
-/** State of a character whose bodies are the first of the scene: its root's height, and what it sees of each body. */
+/** State of a character whose bodies are the first of the scene: the height of the root, and 13 numbers per body. */
 export function character_state(model, data, num_bodies) {
   const [angle, root] = [heading(quaternion(data.xquat, 1)), vector(data.xpos, 1)];
   const bodies = Array.from({ length: num_bodies }, (_, index) => index + 1);
   return [root[2], ...bodies.flatMap((body) => body_in_heading_frame(angle, root, model, data, body))];
 }
 
-/** Bodies of a frame of a clip as a character sees them at an origin and a heading; a body's row has 13 numbers. */
+/** The bodies of a frame of a clip, one row of 13 numbers each, in the frame of an origin and a heading. */
 export function reference_state(angle, origin, bodies) {
   return bodies.flatMap((row) => {
     return in_heading_frame(angle, origin, row.slice(0, 3), row.slice(3, 7), row.slice(7, 10), row.slice(10));
   });
 }
 
-/** Mismatch of two moments, imitation_reward.py: squared differences of positions and, weighted, of velocities. */
-export function mismatch(one, other) {
-  const differences = one.map((value, index) => (value - other[index]) ** 2);
+/** Mismatch of two states, as in imitation_reward.py: squared differences of positions, and weighted ones of velocities. */
+export function mismatch(state, reference) {
+  const differences = state.map((value, index) => (value - reference[index]) ** 2);
   const weights = [1, 1, 1, 0, 0, 0, 0, HORIZON ** 2, HORIZON ** 2, HORIZON ** 2, 0, 0, 0];
   return differences.reduce((sum, value, index) => sum + weights[index % 13] * value, 0);
 }
 
-/** Positions of the same direction whose distance is logarithmic. */
+/** A position in the same direction, at a logarithmic distance. */
 export function logarithmic([x, y]) {
   const distance = Math.hypot(x, y);
   const factor = distance > 0 ? Math.log1p(distance / LINEAR_DISTANCE) / distance : 0;
   return [factor * x, factor * y];
 }
 
-/** A place relative to the centre of mass, in the character's heading frame. */
+/** A place relative to the centre of mass, in the heading frame of the character. */
 export const way = (data, [x, y]) =>
   turned([x - data.subtree_com[3], y - data.subtree_com[4]], heading(quaternion(data.xquat, 1)));
 
@@ -80,7 +80,7 @@ export const place_seen = (data, place) => logarithmic(way(data, place));
 
 export const place_ahead = ([x, y], [vx, vy]) => [x + WALK_AHEAD * vx, y + WALK_AHEAD * vy];
 
-/** Replace places far aside, which a character could face only by turning on the spot. */
+/** Replace places far to the side, which a character could face only by turning on the spot. */
 export function walkable([x, y]) {
   const [angle, distance] = [Math.atan2(y, x), Math.hypot(x, y)];
   if (Math.abs(angle) <= ASIDE) return [x, y];
@@ -94,7 +94,7 @@ export const apart = ([x, y], [u, v]) => Math.hypot(x - u, y - v);
 
 const normalized = ([x, y]) => [x, y].map((value) => value / Math.max(Math.hypot(x, y), 1e-12));
 
-/** What a character sees of objects, by the number of entries of each body, and the place to go to next. */
+/** The goal of a task with objects: the first `size` numbers of each body, and the waypoint if there is one. */
 export function goal_of(model, data, sizes, is_logarithmic, waypoint) {
   const [angle, root] = [heading(quaternion(data.xquat, 1)), vector(data.xpos, 1)];
   const seen = sizes.flatMap(([body, size]) => {
@@ -104,7 +104,7 @@ export function goal_of(model, data, sizes, is_logarithmic, waypoint) {
   return waypoint ? [...seen, ...place_seen(data, waypoint)] : seen;
 }
 
-/** The box, then on the way on which the box in hand comes to the target, then where the character stands. */
+/** The box, then a place on the way that brings the carried box to the target, then the place of the character. */
 export function carry_waypoint(com, box, target, taken, held) {
   if (!held) return taken ? com : box;
   const [x, y] = normalized([target[0] - box[0], target[1] - box[1]]);
@@ -112,7 +112,7 @@ export function carry_waypoint(com, box, target, taken, held) {
   return [com[0] + length * x, com[1] + length * y];
 }
 
-/** Around the ball until the character is behind it, then through it, then where the character stands. */
+/** Places around the ball until the character is behind it, then a place beyond the ball, then the character's place. */
 export function dribble_waypoint(com, ball, rest, target) {
   if (apart(rest, target) < SUCCESS_DISTANCE) return apart(com, ball) < SUCCESS_REACH ? com : ball;
   const meeting = [(ball[0] + rest[0]) / 2, (ball[1] + rest[1]) / 2];

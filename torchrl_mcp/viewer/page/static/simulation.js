@@ -1,4 +1,4 @@
-// MuJoCo and the networks in the browser: one character, and gates over its primitives.
+// Runs MuJoCo and the networks in the browser, for one character and several gates over its primitives.
 
 import loadMujoco from "./runtimes/mujoco.js";
 import * as ort from "./runtimes/ort.js";
@@ -11,7 +11,7 @@ const fetched = async (name) => {
   return response;
 };
 
-/** Content of a compressed file, also from a server that decompresses. */
+/** Content of a compressed file, even if the server has already decompressed it. */
 async function unpacked(name) {
   const packed = new Uint8Array(await (await fetched(name)).arrayBuffer());
   if (packed[0] !== 0x1f || packed[1] !== 0x8b) return packed.buffer;
@@ -32,8 +32,8 @@ export async function open() {
     model.opt.timestep = description.physics_timestep;
     return { model, data: new mujoco.MjData(model) };
   };
-  const known = new Map(); // clips share a scene and a network
-  const once = async (make, name) => known.get(name) ?? known.set(name, await make(name)).get(name);
+  const loaded = new Map(); // clips share a scene and a network
+  const once = async (make, name) => loaded.get(name) ?? loaded.set(name, await make(name)).get(name);
   for (const gate of description.gates) {
     if (gate.clip) gate.clip.rows = new Float32Array(await (await fetched(gate.clip.file)).arrayBuffer());
     const scene = { mujoco, gate, network: await once(session, gate.network), ...(await once(compiled, gate.scene)) };
@@ -44,8 +44,8 @@ export async function open() {
 
 export class Simulation {
   scene = null;
-  weights = []; // of the primitives
-  pinned = new Map(); // weights that the reader holds, by primitive
+  weights = []; // weights of the primitives in the last step
+  pinned = new Map(); // weights that the reader has fixed, by primitive
   substep = 0;
 
   constructor(description, scenes, primitives, mixer) {
@@ -58,7 +58,7 @@ export class Simulation {
     return this.scene.data.time;
   }
 
-  /** Begin an episode: the character stands at the origin. */
+  /** Begin an episode, in which the character stands at the origin. */
   reset() {
     const { model, data, task } = this.scene;
     this.mujoco.mj_resetData(model, data);
@@ -69,7 +69,7 @@ export class Simulation {
     this.substep = 0;
   }
 
-  /** Go on with another gate: the character moves into the gate's scene as it is. */
+  /** Continue with another gate: the character keeps its state in the scene of that gate. */
   select(index) {
     const { num_qpos, num_qvel } = this.description;
     const qpos = this.scene.data.qpos.slice(0, num_qpos);
@@ -84,13 +84,13 @@ export class Simulation {
     this.refresh();
   }
 
-  /** Update what is observed after a change of the state. */
+  /** Update the observed quantities after a change of the state. */
   refresh() {
     this.mujoco.mj_fwdPosition(this.scene.model, this.scene.data);
     this.mujoco.mj_fwdVelocity(this.scene.model, this.scene.data);
   }
 
-  /** Evaluate the networks: the gate's and the reader's weights, and the action, for an observation and a goal. */
+  /** Return the weights, some of which the reader may have pinned, and the action for an observation and a goal. */
   async act(observation, goal) {
     const { state, loc, scale } = await this.primitives.run({ observation: row(observation) });
     const { gates } = await this.scene.network.run({ state, goal: row(goal) });
@@ -99,13 +99,13 @@ export class Simulation {
     return { weights: Array.from(gates.data), action: Array.from(action.data) };
   }
 
-  /** Advance by a physics step; every few of them, the policy acts. */
+  /** Advance by one physics step; the policy acts in every `substeps`-th step. */
   async advance() {
     const { model, data, task } = this.scene;
     const { num_bodies, action, substeps } = this.description;
     if (this.substep === 0) {
       const decision = await this.act(character_state(model, data, num_bodies), task.goal());
-      if (task !== this.scene.task) return; // the reader has changed the gate meanwhile
+      if (task !== this.scene.task) return; // the reader has chosen another gate in the meantime
       this.weights = decision.weights;
       data.ctrl.set(decision.action.map((value, index) => action[index].centre + value * action[index].scale));
     }
@@ -116,12 +116,12 @@ export class Simulation {
     task.after_step();
   }
 
-  /** Whether the root is less than half as high as in the rest pose. */
+  /** Whether the root is below half of its height in the rest pose. */
   get fallen() {
     return this.scene.data.xpos[5] < this.scene.model.qpos0[2] / 2;
   }
 
-  /** Push the first body with a horizontal force in N, until the next call. */
+  /** Push the first body with a constant horizontal force in N until the next call. */
   push(x, y) {
     this.scene.data.xfrc_applied.set([x, y, 0], 6);
   }

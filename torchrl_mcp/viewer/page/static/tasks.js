@@ -1,16 +1,15 @@
-// What a task remembers between steps, and how a reader steers it: envs/tasks and viewer/steering.py, for one simulation.
+// Tasks with their memory and steering, for one simulation, as in envs/tasks and viewer/steering.py.
 
 import {
   apart, carry_waypoint, character_state, dribble_waypoint, goal_of, heading, logarithmic, mismatch, place_ahead,
   place_seen, quaternion, reference_state, steps, turned, vector, walkable, way,
 } from "./observations.js";
 
-const TURN = Math.PI / 12; // what a key changes: radians, and m/s
-const SPEED_STEP = 0.25;
+const TURN = Math.PI / 12; // radians by which a key turns the target
+const SPEED_STEP = 0.25; // m/s by which a key changes the speed
 const DAMPING = -Math.log(1 - 0.4); // of the ball, dribble.py
 const [HALF_SIZE, TOP_HALF_SIZE, CLEARANCE, RESTING_GAP] = [0.15, 0.14, 0.1, 0.01]; // metres, tables.py and carry.py
-
-const AHEAD = 60; // steps of a clip that are left at least where it begins
+const AHEAD = 60; // least number of steps from the beginning of an episode to the end of its clip
 
 const between = (low, high) => low + (high - low) * Math.random();
 
@@ -29,7 +28,7 @@ class Task {
     return heading(quaternion(this.data.xquat, 1));
   }
 
-  /** Whether the target has other speeds. */
+  /** Whether the speed of the target can be changed. */
   get paces() {
     return this.steers && this.gate.speeds[0] < this.gate.speeds[1];
   }
@@ -40,7 +39,7 @@ class Task {
     return [x + dx, y + dy];
   }
 
-  start() {} // changes the state in which episodes begin
+  start() {} // sets the state in which an episode begins
   after_step() {}
   put() {}
   turn() {}
@@ -111,7 +110,7 @@ export class Location extends Steered {
 
   lead(direction, speed) {
     super.lead(direction, speed);
-    this.leads = speed > 0; // at rest it stands where it is
+    this.leads = speed > 0; // at a speed of 0, the character stands where it is
     this.target = this.com.slice(0, 2);
     this.final_direction = direction;
   }
@@ -150,7 +149,7 @@ class Transport extends Task {
     return vector(this.data.xpos, this.body(name));
   }
 
-  /** Move an object of the scene that has no joints. */
+  /** Move an object without joints. */
   move(name, [x, y]) {
     this.data.mocap_pos.set([x, y], 3 * this.mocap(name));
   }
@@ -201,7 +200,7 @@ export class Carry extends Transport {
     this.put(this.ahead(between(2, 3), between(-0.8, 0.8), box));
   }
 
-  /** Lay the box onto the source at a place, so that it can be taken. */
+  /** Move the source to a place, and lay the box on it, so that the character can take the box. */
   offer([x, y], angle) {
     const turn = [Math.cos(angle / 2), 0, 0, Math.sin(angle / 2)];
     this.data.mocap_pos.set([x, y, this.source_height], 3 * this.mocap("source"));
@@ -212,7 +211,7 @@ export class Carry extends Transport {
     this.taken = false;
   }
 
-  /** Fix the box to the carrier, or let it go. JavaScript cannot write eq_active itself. */
+  /** Fix the box to the carrier, or release it. JavaScript cannot write eq_active directly. */
   fix(held) {
     const { mujoco, model, data } = this;
     const part = mujoco.mjtState.mjSTATE_EQ_ACTIVE.value;
@@ -224,7 +223,7 @@ export class Carry extends Transport {
     this.held = held;
   }
 
-  /** A box that was let go is lifted onto the source where it lies, and then brought to the place. */
+  /** Set the target; a box that was put down is first lifted onto the source where it lies, so that it is taken again. */
   put(place) {
     if (this.taken && !this.held) this.offer(this.place("box"), heading(quaternion(this.data.xquat, this.object)));
     super.put(place);
@@ -234,7 +233,7 @@ export class Carry extends Transport {
     return carry_waypoint(this.com, this.place("box"), this.place("target"), this.taken, this.held);
   }
 
-  /** The carrier takes a box on the source by touching it, and lets it go over the target: Carry.after_step. */
+  /** The carrier takes a box on the source by touching it, and releases it over the target, as in Carry.after_step. */
   after_step() {
     const touching = !this.taken && this.data.sensordata.some((gap) => gap <= 0);
     if (this.held && this.over("target", CLEARANCE + RESTING_GAP)) {
@@ -298,7 +297,7 @@ export class Imitation extends Task {
     this.data.qvel.set(qvel);
   }
 
-  /** Go on at the moment of the clip that is most like the character's state, moved to its place and heading. */
+  /** Begin at the frame of the clip that is most similar to the character's state, moved to its place and heading. */
   begin() {
     const state = character_state(this.model, this.data, this.gate.clip.num_bodies).slice(1);
     const mismatches = this.frames.slice(0, Math.max(this.frames.length - AHEAD, 1)).map((bodies) => {
@@ -312,7 +311,7 @@ export class Imitation extends Task {
     this.shift = [this.place[0] - x, this.place[1] - y];
   }
 
-  /** A place in the clip, before that was moved. */
+  /** A place of the scene in the coordinates of the clip. */
   inverse([x, y]) {
     return [...turned([x - this.shift[0], y - this.shift[1]], this.angle), 0];
   }
