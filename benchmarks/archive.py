@@ -7,7 +7,6 @@ curves. ``torchrl-mcp-report`` reads an unpacked archive.
 import argparse
 import csv
 import io
-import math
 import shlex
 import tarfile
 from collections.abc import Iterator, Sequence
@@ -25,11 +24,26 @@ from torchrl_mcp.report.comparison import cells
 from torchrl_mcp.report.paper import PLACES
 from torchrl_mcp.report.results import Run, find_runs
 from torchrl_mcp.runs.tables import text_table
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, METRICS, MODES, NORMALISED_RETURN, PROVENANCE, replacing
+from torchrl_mcp.training.run_folder import (
+    CONFIG,
+    EVALUATION,
+    METRICS,
+    MODES,
+    NORMALISED_RETURN,
+    PROVENANCE,
+    read_metrics,
+    replacing,
+)
 
 ARCHIVE = "runs.tar.xz"
-CURVE = ("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN)
-"""Columns of metrics in an archive, which are needed for learning curves and wall times."""
+SUCCESS = "task/success"
+"""Column of metrics with the share of training steps with a success, in tasks that define success."""
+
+CURVE = (
+    *("iteration", "frames", "seconds", "episode/count", NORMALISED_RETURN, "episode/length"),
+    *(SUCCESS, "loss/kl", "policy/std"),
+)
+"""Columns of metrics in an archive, if a run has them: learning curves, wall times, and the size of updates."""
 
 EMPTY = ""
 """Text of a table's cell without runs, or without a number in the paper."""
@@ -103,9 +117,8 @@ def write_tables(groups: Sequence[Cell], output: Path) -> None:
         of_task = [cell for cell in groups if (cell.place, cell.stage) == (place, stage)]
         twice = stage == "pretrain" and place in PLACES  # holdout is learned in both stages
         stem = output / "_".join([*place, stage] if twice else place)
-        curves = [curve for cell in of_task if (curve := learning_curve(cell))]
-        goal = 0.8 * max((float(curve.mean[-1]) for curve in curves), default=math.inf)
-        stem.with_suffix(".md").write_text(text_table([line(cell, goal) for cell in of_task], markdown=True) + "\n")
+        lines = [line(cell) | time for cell, time in zip(of_task, times(of_task), strict=True)]
+        stem.with_suffix(".md").write_text(text_table(lines, markdown=True) + "\n")
         drawn = [cell for cell in of_task if stage == "pretrain" or cell.method == "scratch" or is_short(cell, of_task)]
         if curves := [curve for cell in drawn if (curve := learning_curve(cell))]:
             figure = draw_curves(curves, ylabel="normalised return in training")
@@ -140,8 +153,8 @@ def label(cell: Cell) -> str:
     return ", ".join([cell.title, *steps, *settings])
 
 
-def line(cell: Cell, goal: float) -> dict[str, Any]:
-    """Return a row of the table of a task, with the minutes until the return in training reaches ``goal``."""
+def line(cell: Cell) -> dict[str, Any]:
+    """Return a row of the table of a task, without the columns of :func:`times`."""
     chosen = [run.evaluation["deterministic"] for run in cell.complete]
     deviation = f" ± {cell.deviation():.3f}" if len(cell.by_seed) > 1 else ""
     facts: dict[str, Any] = {
@@ -161,26 +174,41 @@ def line(cell: Cell, goal: float) -> dict[str, Any]:
     else:
         facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
         facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
-    taken = minutes_to(cell, goal)
-    times = {"minutes": round(cell.seconds / 60), "to 0.8": EMPTY if taken is None else f"{taken:.1f}"}
-    return facts | times | {"commit": ", ".join(cell.commits)}
+    return facts
 
 
-def minutes_to(cell: Cell, goal: float) -> float | None:
-    """Return the minutes of training until the learning curve, a mean over seeds, reaches a return, or None."""
-    if not (curve := learning_curve(cell)):
-        return None
+def times(of_task: Sequence[Cell]) -> Iterator[dict[str, Any]]:
+    """Yield the last columns of each row of the table of a task: minutes of training, speed of learning, commits.
+
+    The speed is the time until a learning curve reaches 0.8 of the highest final return of the table. Where a success
+    ends the training episode, this return is reached soon and says little. The speed is then the time until the share
+    of steps with a success is half of the highest final share; the column is omitted for archives without this share.
+    """
+    ends_at_success = any("success" in cell.metrics for cell in of_task)
+    quantity, share_of_best, name = (SUCCESS, 0.5, "to half") if ends_at_success else (NORMALISED_RETURN, 0.8, "to 0.8")
+    curves = [learning_curve(cell, quantity) for cell in of_task]
+    final = [float(curve.mean[-1]) for curve in curves if curve]
+    for cell, curve in zip(of_task, curves, strict=True):
+        taken = minutes_to(cell, curve, share_of_best * max(final)) if curve else None
+        speed = {name: EMPTY if taken is None else f"{taken:.1f}"} if final or not ends_at_success else {}
+        yield {"minutes": round(cell.seconds / 60)} | speed | {"commit": ", ".join(cell.commits)}
+
+
+def minutes_to(cell: Cell, curve: Curve, goal: float) -> float | None:
+    """Return the minutes of training until a cell's learning curve, a mean over seeds, reaches a goal, or None."""
     reached = [frames for frames, value in zip(curve.frames, curve.mean, strict=True) if value >= goal]
     return float(reached[0]) / cell.complete[0].frames * cell.seconds / 60 if reached else None
 
 
-def learning_curve(cell: Cell) -> Curve | None:
+def learning_curve(cell: Cell, quantity: str = NORMALISED_RETURN) -> Curve | None:
     """Return the learning curve of a cell, from the first run of each seed, in bins of the cell's steps.
 
-    Runs in which no episode of full length has ended are omitted. If no run remains, the result is None.
+    Runs in which no episode of full length has ended, or whose metrics lack the quantity, are omitted. If no run
+    remains, the result is None.
     """
     paths = [runs[0].path for runs in cell.by_seed.values() if runs[0].has_episodes]
-    return learning_curves({label(cell): paths})[0] if paths else None
+    paths = [path for path in paths if quantity in read_metrics(path)[0]]
+    return learning_curves({label(cell): paths}, quantity=quantity)[0] if paths else None
 
 
 def score(cell: Cell | None) -> str:

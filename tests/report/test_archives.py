@@ -44,33 +44,71 @@ def normalised_return(evaluations):
     return mean(each["normalised_return"] for each in evaluations)
 
 
-def add_tracking_error(run):
-    """Give an evaluation the metric that imitation has."""
+def add_metrics(run, metrics):
+    """Give an evaluation the metrics of a task."""
     path = run / "evaluation.json"
     found = json.loads(path.read_text())
     for mode in ("deterministic", "stochastic"):
-        found[mode]["metrics"] = {"tracking_error": 0.05}
+        found[mode]["metrics"] = metrics
     path.write_text(json.dumps(found))
 
 
-def test_the_minutes_to_a_return_are_those_of_the_learning_curve(write_run, monkeypatch):
+@pytest.fixture
+def archive(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    archive = importlib.import_module("archive")
-    run = write_run("run", score=0.9)
-    rows = [(i, 10 * i, 6 * i, 1, i / 100) for i in range(1, 101)]  # a return that grows with time, for ten minutes
-    header = (run / "metrics.csv").read_text().splitlines()[0].split(",")
+    return importlib.import_module("archive")
+
+
+def learn(run, column, best):
+    """Let a quantity grow with time to its best value in ten minutes of a run."""
+    rows = [{"iteration": i, "frames": 10 * i, "seconds": 6 * i, column: best * i / 100} for i in range(1, 101)]
+    rows = [{"episode/count": 1, "episode/normalised_return": 0.5} | row for row in rows]
     with (run / "metrics.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([header, *rows])
-    (cell,) = cells(find_runs([run.parent])[0])
-    assert archive.minutes_to(cell, 0.8) == pytest.approx(8.0, abs=0.2)
-    assert archive.minutes_to(cell, 1.1) is None
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def times_of(archive, folder, name):
+    """The minutes in a column of the table of a task, by method."""
+    found = cells(find_runs([folder])[0])
+    times = zip(found, archive.times(found), strict=True)
+    return {cell.method: float(row[name]) if row[name] else None for cell, row in times}
+
+
+def test_minutes_until_four_fifths_of_the_best_return_are_those_of_the_learning_curve(write_run, archive, tmp_path):
+    learn(write_run("best", score=0.9), "episode/normalised_return", best=1.0)
+    learn(write_run("worse", method="finetune", score=0.5), "episode/normalised_return", best=0.7)
+    times = times_of(archive, tmp_path / "runs", "to 0.8")
+    assert times["scratch"] == pytest.approx(8.0, abs=0.2)
+    assert times["finetune"] is None
+
+
+def test_where_success_ends_episodes_it_is_the_minutes_until_half_of_the_best_share_of_successes(
+    write_run, archive, tmp_path
+):
+    for method, best in (("scratch", 0.001), ("finetune", 0.0006), ("moe", None)):
+        run = write_run(method, task="carry", method=method, score=0.5)
+        add_metrics(run, {"success": 0.5})
+        if best:
+            learn(run, "task/success", best)
+    times = times_of(archive, tmp_path / "runs", "to half")
+    assert times["scratch"] == pytest.approx(5.0, abs=0.2)
+    assert times["finetune"] == pytest.approx(5.0 / 0.6, abs=0.2)
+    assert times["moe"] is None  # archived without successes
+
+
+def test_an_archive_without_successes_has_no_time_to_half_of_them(write_run, archive, tmp_path):
+    add_metrics(write_run("old", task="carry", score=0.5), {"success": 0.5})
+    (row,) = archive.times(cells(find_runs([tmp_path / "runs"])[0]))
+    assert list(row) == ["minutes", "commit"]
 
 
 @pytest.fixture
 def results(tmp_path, run_writers, monkeypatch):
     root = tmp_path / "runs"
     write, write_mcp = run_writers(root)
-    add_tracking_error(write_mcp("source", stage="pretrain", task="imitation", score=0.5))
+    add_metrics(write_mcp("source", stage="pretrain", task="imitation", score=0.5), {"tracking_error": 0.05})
     write_mcp("gate", score=0.9, pretrained=str(root / "source"))
     write_mcp("long", score=0.95, total_frames=4000, pretrained=str(root / "source"))
     for seed, score in enumerate((0.8, 0.9)):
@@ -240,7 +278,9 @@ def test_the_table_of_ablations_has_a_row_for_each_variant(tmp_path, run_writers
         for seed, change in enumerate((0.0, 0.1)):
             write_mcp(f"{name}{seed}", seed=seed, score=score + change, **settings)
     for name, settings in (("source", {}), ("source_of_four", {"num_primitives": 4})):
-        add_tracking_error(write_mcp(name, stage="pretrain", task="imitation", score=0.5, **settings))
+        add_metrics(
+            write_mcp(name, stage="pretrain", task="imitation", score=0.5, **settings), {"tracking_error": 0.05}
+        )
     write_mcp("dribbling", task="dribble", score=0.3)
     tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path / "results", script="ablations")
     assert cells_of((tmp_path / "results/table.md").read_text()) == [
@@ -265,7 +305,8 @@ def test_ablations_of_several_characters_have_a_column_each_and_other_methods_no
     write, write_mcp = run_writers(tmp_path / "runs")
     for character, score in (("biped", 0.5), ("humanoid", 0.25)):
         write_mcp(character, task="dribble", character=character, score=score)
-    add_tracking_error(write_mcp("source", stage="pretrain", task="imitation", character="humanoid", score=0.5))
+    source = write_mcp("source", stage="pretrain", task="imitation", character="humanoid", score=0.5)
+    add_metrics(source, {"tracking_error": 0.05})
     write("scratch", task="dribble", score=0.125)
     tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path, script="ablations")
     head, row = cells_of((tmp_path / "table.md").read_text())
