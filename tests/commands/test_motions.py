@@ -358,7 +358,7 @@ WRONG = {
     "missing bodies": (["import", "stand.txt", "--bodies", "nowhere.yaml"], "nowhere.yaml"),
     "no module": (
         ["import", "stand.txt", "--module", "nowhere"],
-        "--module names nowhere, which Python does not find: call from the folder",
+        "--module names nowhere, which Python does not find: ",
     ),
     "unknown character": (["import", "stand.csv", "--character", "cat"], "character='cat' does not exist"),
     "no rate": (["import", "stand.csv"], r"stand\.csv: has no frame rate: pass it \(--fps\)"),

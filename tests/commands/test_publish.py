@@ -131,7 +131,7 @@ def test_carrying_begins_as_a_gate_that_goes_to_places(tmp_path):
     ("task", "pretrained", "entry", "remedy"),
     [
         ("carry", "builtin", "place", "target.position"),
-        ("heading", "builtin", "place", "leave it out"),
+        ("heading", "builtin", "place", "omit it"),
         ("carry", "builtin:biped-location", "waypoint", "transfer.keep"),  # whose networks did not see it
     ],
 )
@@ -220,7 +220,7 @@ def test_over_other_primitives_than_its_own_a_gate_is_neither_played_nor_publish
         "mcp-biped.torchrl",
     )
     said = stopped(publish, run, "--output", tmp_path / "again.torchrl")
-    assert "trained over other primitives than mcp-biped.torchrl" in said
+    assert "mcp-biped.torchrl: train the policy again with pretrained=builtin" in said
 
 
 def test_what_is_no_run_folder_or_no_checkpoints_name_is_refused(run, monkeypatch, tmp_path):

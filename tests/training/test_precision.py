@@ -113,7 +113,7 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
         experiment.resume(folder)
     said = capsys.readouterr().out
     assert "continues on Another (cpu)" in said
-    assert f"with networks in {word} as it began" in said
+    assert f"with networks in {word}" in said
     assert set(seen) == {chosen}
 
 

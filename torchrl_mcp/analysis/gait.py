@@ -55,7 +55,8 @@ def stride_phases(standing: NDArray[np.bool_]) -> NDArray[np.float64]:
     Returns:
         Phases in [0, 1), ``(T,)``; NaN outside complete strides.
     """
-    right, left = (touch_downs(foot) for foot in np.asarray(standing).T)
+    right = touch_downs(standing[:, 0])
+    left = touch_downs(standing[:, 1])
     phases = np.full(len(standing), np.nan)
     for start, stop in pairwise(right.tolist()):
         if np.count_nonzero((left >= start) & (left < stop)) == 1:

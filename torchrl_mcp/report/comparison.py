@@ -77,8 +77,8 @@ def ablations(cells: Iterable[Cell], setting: str) -> list[Ablation]:
     """Return the groups of cells that differ only in one of the :func:`choices`."""
 
     def rest(cell: Cell) -> Hashable:
-        others = _frozen({k: v for k, v in {**cell.choices, **cell.settings}.items() if k != setting})
-        return cell.place, cell.stage, cell.method, others
+        settings = {k: v for k, v in {**cell.choices, **cell.settings}.items() if k != setting}
+        return cell.place, cell.stage, cell.method, _frozen(settings)
 
     groups = grouped((cell for cell in cells if cell.choices.get(setting) is not None), rest).values()
     return [

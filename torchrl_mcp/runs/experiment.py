@@ -52,7 +52,7 @@ def resume(
         moves: New places of files and folders outside the run folder, by the names of their settings.
 
     Raises:
-        ValueError: If the folder holds no run, another process uses the folder, the checkpoint is damaged,
+        ValueError: If the folder is not a run folder, another process uses the folder, the checkpoint is damaged,
             ``total_frames`` is not a number of steps or less than the run has taken, ``moves`` names a setting without
             a file, or this machine lacks the device, the logger or a file. The run is unchanged in all these cases.
     """

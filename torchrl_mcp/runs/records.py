@@ -21,7 +21,7 @@ def run_config(folder: Path) -> DictConfig:
     """Return the configuration of the run in ``folder``.
 
     Raises:
-        ValueError: If the folder holds no run, or a run of another version of the library.
+        ValueError: If the folder is not a run folder, or a run of another version of the library.
     """
     return located(_stored_config(folder), folder)
 
@@ -44,7 +44,7 @@ def is_complete(folder: Path, cfg: DictConfig | None = None) -> bool:
         cfg: Configuration of the run, or None to read it from the folder.
 
     Raises:
-        ValueError: If the folder holds no run.
+        ValueError: If the folder is not a run folder.
     """
     cfg = cfg or run_config(folder)
     trained = run_folder.frames(checkpoint.find(folder)) >= cfg.training.total_frames
@@ -61,7 +61,7 @@ def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
         config: The configuration of a :class:`.configuration.Plan`.
 
     Raises:
-        ValueError: If the folder holds no run, or a run of another version of the library.
+        ValueError: If the folder is not a run folder, or a run of another version of the library.
     """
     stored = places.stored(run_config(folder))
     inputs = _origin(folder).get("inputs", {})
@@ -70,7 +70,7 @@ def changes(folder: Path, config: Mapping[str, Any]) -> list[str]:
 
 
 def require_free(folder: Path, config: Mapping[str, Any]) -> None:
-    """Check that a folder holds no run yet.
+    """Check that a folder contains no run yet.
 
     Args:
         folder: The run folder.
@@ -135,8 +135,8 @@ def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) 
         moves: New places, by the names of their settings; names that the run lacks are ignored.
 
     Raises:
-        ValueError: If the folder holds no run, or ``total_frames`` is not a number of steps or less than the run has
-            taken.
+        ValueError: If the folder is not a run folder, or ``total_frames`` is not a number of steps, or is less than the
+            run has taken.
     """
     config = _stored_config(folder)
     planned = config["training"]["total_frames"]
@@ -198,10 +198,10 @@ def _stored_config(folder: Path) -> dict[str, Any]:
     """Return the configuration in a run folder in its stored form.
 
     Raises:
-        ValueError: If the folder holds no run, or the configuration is damaged.
+        ValueError: If the folder is not a run folder, or the configuration is damaged.
     """
     if not (folder / CONFIG).is_file():
-        raise ValueError(f"{folder} holds no run: it has no {CONFIG}")
+        raise ValueError(f"{folder} is not a run folder: it has no {CONFIG}")
     config = read_config(folder / CONFIG)
     if missing := [name for name in ("task", "stage", "training") if name not in config]:
         raise ValueError(

@@ -28,7 +28,8 @@ class EpisodeStatistics:
 
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Add trajectories ``(N, T)``; return the return and length of each of the ``E`` ended episodes, ``(E,)``."""
-        ended_returns, ended_lengths = [], []
+        ended_returns = []
+        ended_lengths = []
         self.steps += batch.shape[1]
         rewards = task_reward(batch["next"]).squeeze(-1).cpu()
         dones = batch["next", "done"].squeeze(-1).cpu()

@@ -105,8 +105,8 @@ def relative_time(device: torch.device | str) -> float:
     products = [[x.to(dtype) for x in operands] for dtype in (torch.bfloat16, torch.float32)]
     with threads(1):  # another run may use the other cores
         times = [[_seconds(*product) for product in products] for _ in range(1 + REPEATS)]  # the first prepares kernels
-    low, full = (min(of_product) for of_product in zip(*times[1:], strict=True))
-    return low / full
+    bfloat16_times, float32_times = zip(*times[1:], strict=True)
+    return min(bfloat16_times) / min(float32_times)
 
 
 def _seconds(rows: torch.Tensor, weight: torch.Tensor) -> float:
