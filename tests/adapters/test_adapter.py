@@ -1,15 +1,20 @@
 """Environments of TorchRL as the adapter shows them, against what a loop by hand over the environments shows."""
 
+import warnings
+
+import numpy as np
 import pytest
 import torch
 from points import Lasting, Points, play
 from refusals import refused
 from torchrl.collectors import Collector
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import check_env_specs
+from torchrl.envs import TransformedEnv, check_env_specs
 
 from torchrl_mcp.adapters.adapter import Adapter, OwnEnvs
+from torchrl_mcp.adapters.autoreset import RepeatObservation
 from torchrl_mcp.adapters.check import require_contract, require_specs
+from torchrl_mcp.adapters.reading import Scaling
 
 
 def adapted(env=None, **settings):
@@ -181,6 +186,36 @@ def test_bounds_of_ones_own_take_the_place_of_infinite_ones():
     torch.testing.assert_close(moved, torch.full_like(moved, 3.0))
 
 
+def test_bounds_of_ones_own_are_on_the_device_of_the_environments():
+    class Elsewhere:
+        action_keys = ("action",)
+        action_spec = Unbounded((3, 2), device="meta")
+
+    scaling = Scaling(Elsewhere(), [-1.0, 1.0])
+    assert scaling(torch.zeros(3, 2, device="meta")).device.type == "meta"
+
+
+class Drawn(Points):
+    """Points that draw the environment of an index."""
+
+    def render(self, index):
+        return np.full((2, 3, 3), index, np.uint8)
+
+
+class Shown(Points):
+    """Points whose method of the same name shows a window."""
+
+    def render(self, mode="human"):
+        raise AssertionError
+
+
+def test_films_call_the_method_that_draws_an_environment_by_its_index():
+    env = OwnEnvs(Drawn, 3, observation=["place"], max_episode_steps=4)
+    assert env.render(2).unique().tolist() == [2]
+    env = OwnEnvs(Shown, 3, observation=["place"], max_episode_steps=4)
+    refused(env.render, "Shown", "render(index)", error=RuntimeError)
+
+
 def test_an_observation_that_is_no_number_is_an_error_that_names_its_place():
     def corrupt(outcome):
         outcome["place"][1, 0, 1] = torch.nan
@@ -219,6 +254,18 @@ def test_environments_that_reset_themselves_are_pointed_out_once():
     with pytest.warns(UserWarning, match="reset itself") as warned:
         play(env, torch.full((12, 3, 1), 0.9))
     assert len(warned) == 1
+
+
+def test_environments_that_reset_themselves_can_repeat_the_observation_before_the_last_step():
+    env = adapted(TransformedEnv(SelfResetting(), RepeatObservation()), max_episode_steps=100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        outcome = play(env, torch.full((12, 3, 1), 0.9))
+    done = outcome["next", "done"].squeeze(-1)
+    assert done.sum() > 6
+    assert torch.equal(outcome["next", "observation"][done], outcome["observation"][done])
+    first = outcome["observation"][:, 1:][done[:, :-1]][:, 0]
+    assert ((first > 0) & (first < 1)).all()
 
 
 def test_a_class_that_is_no_environment_or_lacks_a_member_is_refused_by_name():

@@ -78,6 +78,16 @@ class SelfResetting(Point):
 
 
 gymnasium.register("SelfResetting-v0", entry_point=SelfResetting, max_episode_steps=9)
+
+
+class Old(Point):
+    """A point that needs another version of a library."""
+
+    def __init__(self):
+        assert gymnasium.__version__ == "0.1"
+
+
+gymnasium.register("Old-v0", entry_point=Old, max_episode_steps=9)
 gymnasium.register(
     "Autoreset-v0",
     entry_point=lambda: gymnasium.wrappers.Autoreset(Point()),
@@ -93,6 +103,7 @@ gymnasium.register(
         ("Nowhere-v0", {}, ["id", "Nowhere"]),
         ("nowhere:Nowhere-v0", {}, ["id", "nowhere"]),
         ("Point-v0", {"kwargs": {"size": 3}}, ["id", "size"]),
+        ("Old-v0", {}, ["id", "AssertionError", "test_gym.py"]),
         ("Point-v0", {"info": ["success"]}, ["info", "success", "is_success"]),
         ("CartPole-v1", {}, ["action", "discrete"]),
         ("Autoreset-v0", {}, ["id", "Autoreset"]),

@@ -49,6 +49,16 @@ def test_a_run_knows_what_its_files_say(write_run):
     assert run.evaluation["stochastic"]["normalised_return"] == pytest.approx(0.65)
 
 
+def test_environments_of_another_library_have_their_name_in_place_of_a_character(write_run):
+    ids = {"task__transfer__id": "Hopper-v5", "task__pretrain__id": "Ant-v5"}
+    run = read_run(write_run("a", task="gymnasium", character="none", **ids))
+    assert run.place == ("gymnasium", "Hopper-v5")
+    run = read_run(write_run("b", task="gymnasium", character="none", stage="pretrain", **ids))
+    assert run.place == ("gymnasium", "Ant-v5")
+    run = read_run(write_run("c", task="torchrl", character="none", task__transfer__env___target_="walker.make"))
+    assert run.place == ("torchrl", "walker.make")
+
+
 @pytest.mark.parametrize(
     ("settings", "state"),
     [

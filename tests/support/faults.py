@@ -49,6 +49,8 @@ FAULTS = {
         ("self._env.close(raise_if_closed=False)", "pass", "adapters/test_adapter.py"),
         ("if len(env.batch_size) != 1", "if False", "adapters/test_adapter.py"),
         ("if not limit:", "if False:", "adapters/test_adapter.py"),
+        ('"max_episode_steps", "max_episode_length"', '"max_episode_steps",', "adapters/test_autoreset.py"),
+        ('"index" in inspect', '"mode" in inspect', "adapters/test_adapter.py"),
     ],
     "torchrl_mcp/adapters/reading.py": [
         ("self.half * action.clamp(-1.0, 1.0)", "self.half * action", "adapters/test_adapter.py"),
@@ -60,6 +62,9 @@ FAULTS = {
     "torchrl_mcp/adapters/gym.py": [
         ("if finals := [name for name in FINAL if name in info]", "if finals := []", "adapters/test_gym.py"),
         ("isinstance(wrapper, gymnasium.wrappers.Autoreset)", "False", "adapters/test_gym.py"),
+    ],
+    "torchrl_mcp/adapters/autoreset.py": [
+        ("tensordict[key], observed)", "observed, observed)", "adapters/test_autoreset.py")
     ],
     # Distributions and networks
     "torchrl_mcp/distributions/multiplicative.py": [
@@ -611,6 +616,7 @@ FAULTS = {
         ("if len(group) > 1\n    ]", "if group\n    ]", "report/test_comparison.py"),
     ],
     "torchrl_mcp/report/results.py": [
+        ('self.settings.get(f"task.{self.stage}.{key}")', "None", "report/test_results.py"),
         ("if self.frames < self.total_frames", "if self.frames <= self.total_frames", "report/test_results.py"),
         (
             "if not math.isfinite(value):\n                raise",

@@ -22,6 +22,9 @@ from torchrl_mcp.adapters.reading import Number, Scaling, Vector
 GOALS = ("desired_goal", "goal")
 """Keys of the goal, of which the first that is observed is taken by default; Gymnasium's is ``desired_goal``."""
 
+LIMITS = ("max_episode_steps", "max_episode_length")
+"""Attributes of environments with the number of steps of an episode; Isaac Lab's and mjlab's is the second."""
+
 CONTROL_TIMESTEP = 0.05
 """Seconds of a step of environments that do not say how long it is; only films show it."""
 
@@ -43,7 +46,7 @@ class Adapter(EnvBase):
             a number. ``method=hierarchical`` needs it in pre-training, because it trains a primitive for each goal.
         metrics: Keys of flags (bool) and numbers that are not inputs of the policy, such as ``success``.
         max_episode_steps: Steps after which an episode is ``truncated``, if it has not ended before. None takes the
-            attribute of the same name of ``env``.
+            attribute of ``env`` of this name or ``max_episode_length``.
         worst: Return at which the normalised return is 0.
         solved: Return at which the normalised return is 1. With ``worst`` 0 and ``solved`` 1, the normalised return is
             the return itself.
@@ -94,7 +97,7 @@ class Adapter(EnvBase):
                 f"{name} has the batch size {list(env.batch_size)}, but N environments side by side have [N]: wrap it "
                 "in torchrl.envs.SerialEnv(N, ...)"
             )
-        limit = max_episode_steps or getattr(env, "max_episode_steps", None)
+        limit = max_episode_steps or _limit(env)
         if not limit:
             raise ValueError(f"{name} has no limit on the length of its episodes: pass max_episode_steps=STEPS")
         if solved == worst:
@@ -159,7 +162,9 @@ class Adapter(EnvBase):
         """
         picture = None if self._draw is None else self._draw(index)
         if picture is None:
-            raise RuntimeError(f"{self.name} cannot be drawn: it needs a render_mode of rgb_array")
+            raise RuntimeError(
+                f"{self.name} cannot be drawn: it needs a render_mode of rgb_array, or a method render(index)"
+            )
         return torch.as_tensor(np.array(picture))
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
@@ -280,10 +285,7 @@ class Adapter(EnvBase):
         try:
             yield
         except Exception as error:  # others' environments raise anything, also when a process of theirs has died
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            raise ChildProcessError(
-                f"{self.name} failed in {what}: {type(error).__name__}: {error} ({frame.filename}, line {frame.lineno})"
-            ) from error
+            raise ChildProcessError(f"{self.name} failed in {what}: {described(error)}") from error
         finally:
             self.physics_seconds += time.perf_counter() - begun
 
@@ -296,7 +298,8 @@ class Adapter(EnvBase):
         self._warned = True
         warnings.warn(
             f"{self.name} seems to reset itself: the last observation of an episode is the first of the next, so that "
-            "values of truncated episodes are wrong. Turn its own resets off",
+            "values of truncated episodes are wrong. Turn its own resets off, or append the transform "
+            "torchrl_mcp.adapters.autoreset.RepeatObservation",
             stacklevel=2,
         )
 
@@ -306,7 +309,9 @@ class OwnEnvs(Adapter):
 
     Args:
         env: Function ``env(num_envs=, seed=)`` that makes environments of batch size ``[num_envs]``. A function without
-            ``num_envs`` makes a single environment, and TorchRL's ``SerialEnv`` puts several side by side.
+            ``num_envs`` makes a single environment, and TorchRL's ``SerialEnv`` puts several side by side. Films call
+            the method ``render(index)`` of the environments, if there is one; it returns what :meth:`Adapter.render`
+            returns.
         num_envs: Number of environments.
         seed: Seed of the environments.
         **settings: Passed on to :class:`Adapter`.
@@ -321,6 +326,24 @@ class OwnEnvs(Adapter):
         taken = inspect.signature(maker.__init__ if inspect.isclass(maker) else maker).parameters
         given = {name: value for name, value in (("num_envs", num_envs), ("seed", seed)) if name in taken}
         made = env(**given) if "num_envs" in taken else SerialEnv(num_envs, env)
-        super().__init__(made, **settings)
+        super().__init__(made, **{"render": _render(made), **settings})
         if seed is not None:
             self.set_seed(seed)
+
+
+def described(error: Exception) -> str:
+    """Return the type, the message and the place of an error of another library."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({frame.filename}, line {frame.lineno})"
+
+
+def _limit(env: EnvBase) -> int | None:
+    """Return the number of steps of an episode that environments name, if they do."""
+    values = (getattr(env, name, None) for name in LIMITS)
+    return next((value for value in values if isinstance(value, int)), None)
+
+
+def _render(env: EnvBase) -> Callable[[int], Any] | None:
+    """Return the method ``render(index)`` of environments, if there is one; libraries have others of the same name."""
+    render = getattr(type(env), "render", None)
+    return env.render if render is not None and "index" in inspect.signature(render).parameters else None

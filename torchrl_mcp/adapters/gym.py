@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, default_info_dict_reader
 
-from torchrl_mcp.adapters.adapter import Adapter
+from torchrl_mcp.adapters.adapter import Adapter, described
 
 RGB_ARRAY = "rgb_array"
 
@@ -125,6 +125,8 @@ def _made(id: str, arguments: Mapping[str, Any]) -> gymnasium.Env:
         env = gymnasium.make(id, **arguments)
     except (gymnasium.error.Error, ImportError, TypeError) as error:
         raise ValueError(f"gymnasium.make cannot make id={id}: {error}") from error
+    except Exception as error:  # others' environments raise anything, for example with another version of MuJoCo
+        raise ValueError(f"gymnasium.make cannot make id={id}: {described(error)}") from error
     wrapper: Any = env
     while isinstance(wrapper, gymnasium.Wrapper):
         if isinstance(wrapper, gymnasium.wrappers.Autoreset):

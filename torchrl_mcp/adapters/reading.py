@@ -128,8 +128,8 @@ class Scaling:
         spec = env.action_spec
         self.shape = spec.shape
         low, high = _bounds(spec, bounds)
-        self.centre = (low + high) / 2
-        self.half = (high - low) / 2
+        self.centre = ((low + high) / 2).to(spec.device)
+        self.half = ((high - low) / 2).to(spec.device)
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return the environments' actions, ``(N, A)``, for actions of the policy."""

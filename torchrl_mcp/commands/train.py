@@ -178,11 +178,11 @@ def _explained(cfg: "DictConfig") -> Iterator[None]:
 
     try:
         yield
-    except (ValueError, FloatingPointError) as error:
+    except ValueError as error:
         sys.exit(f"{PROGRAM}: {error}")
     except HydraException as error:
         sys.exit(f"{PROGRAM}: {'; '.join(str(error).splitlines())}{_place(error)}")
-    except OSError as error:
+    except (OSError, FloatingPointError) as error:
         sys.exit(f"{PROGRAM}: {error}. {_what_is_safe(cfg)}")
     except KeyboardInterrupt:
         sys.exit(f"\n{PROGRAM}: interrupted. {_what_is_safe(cfg)}")

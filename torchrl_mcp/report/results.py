@@ -85,8 +85,10 @@ class Run:
 
     @property
     def place(self) -> tuple[str, str]:
-        """Names of task and character."""
-        return self.settings["task.name"], self.settings["character.name"]
+        """Names of task and character; environments of another library have their name in place of a character."""
+        names = [self.settings.get(f"task.{self.stage}.{key}") for key in ("id", "env._target_")]
+        environments = [name for name in names if isinstance(name, str)]
+        return self.settings["task.name"], environments[0] if environments else self.settings["character.name"]
 
     @property
     def method(self) -> str:

@@ -144,8 +144,8 @@ class Trainer:
             metrics = self.update(batch, warming_up=warming_up)
         except FloatingPointError as error:
             raise FloatingPointError(
-                f"{error} in iteration {self.progress.iteration + 1}. The last checkpoint before it is "
-                f"{self.folder.checkpoints.latest()}: try a smaller step size or max_grad_norm"
+                f"{error} in iteration {self.progress.iteration + 1}; another run with a smaller step size or "
+                "max_grad_norm may avoid this"
             ) from error
         if not warming_up:
             self._update_normalisers(batch)
