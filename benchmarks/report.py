@@ -3,7 +3,6 @@
 The library is imported inside functions, because benchmarks also run contenders in interpreters without the library.
 """
 
-import csv
 import importlib.metadata
 from contextlib import suppress
 from datetime import date
@@ -35,11 +34,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write rows with the same keys as CSV."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    from torchrl_mcp.runs.tables import write_csv
+
+    write_csv(rows, path)
 
 
 def peak_memory(pid: int) -> float:

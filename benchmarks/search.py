@@ -40,6 +40,8 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from report import write
+
 SEEDS = (100, 101)
 """Seeds of the trials. Tables use seeds from 0."""
 
@@ -322,11 +324,7 @@ class Table:
         """Add a row, and write the file."""
         row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings), "processor": processor()}
         self.rows.append({name: str(value) for name, value in row.items()})
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(self.rows[0]))
-            writer.writeheader()
-            writer.writerows(self.rows)
+        write(self.path, self.rows)
 
     def score(self, trial: int) -> float:
         """Return the mean score of a trial's seeds in its last evaluation."""

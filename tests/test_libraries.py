@@ -77,7 +77,7 @@ def require_film(folder, *options):
     if not opengl._platform():
         pytest.skip("there is no OpenGL library for drawing without a display")
     film = folder / "film.gif"
-    words = [sys.executable, "-m", "torchrl_mcp.cli.play", *options, folder, "--output", film, "--seconds", "1"]
+    words = [sys.executable, "-m", "torchrl_mcp.commands.play", *options, folder, "--output", film, "--seconds", "1"]
     outcome = subprocess.run(
         words, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True, text=True
     )

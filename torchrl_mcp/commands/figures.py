@@ -1,7 +1,6 @@
 """``torchrl-mcp-figures``: the paper's Figures 5, 6 and 7 from trained networks, as PNG and SVG, their data as CSV."""
 
 import argparse
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -257,12 +256,10 @@ def _save(figure: "Figure", stem: Path) -> None:
 
 
 def _write(rows: Sequence[Mapping[str, object]], stem: Path, part: str = "") -> None:
+    from torchrl_mcp.runs.tables import write_csv
+
     path = stem.with_name(f"{stem.name}{part and '_'}{part}.csv")
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{x:.5g}" if isinstance(x, float) else x for key, x in row.items()})
+    write_csv(rows, path, digits=5)
     print(path)
 
 

@@ -1,7 +1,9 @@
 """Formats tables of commands and benchmarks as text."""
 
+import csv
 from collections.abc import Mapping, Sequence
 from io import StringIO
+from pathlib import Path
 
 from rich.box import MARKDOWN
 from rich.console import Console
@@ -29,6 +31,22 @@ def text_table(rows: Sequence[Mapping[str, object]], *, markdown: bool = False) 
     return as_text(table)
 
 
+def write_csv(rows: Sequence[Mapping[str, object]], path: Path, *, digits: int | None = None) -> None:
+    """Write rows with the same names as CSV.
+
+    Args:
+        rows: Cells by column name.
+        path: The file, whose folder is made.
+        digits: Significant digits of floats, None for all.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            writer.writerow(row if digits is None else {name: _rounded(cell, digits) for name, cell in row.items()})
+
+
 def as_text(table: Table) -> str:
     """Return a table as text without folded lines and colours."""
     console = Console(file=StringIO(), width=WIDEST, color_system=None)
@@ -40,6 +58,10 @@ def as_text(table: Table) -> str:
 def plain_table(caption: str | None = None) -> Table:
     """Return an empty table without rules, with a caption below."""
     return Table(caption=caption, caption_justify="left", box=None, padding=(0, 2, 0, 0))
+
+
+def _rounded(value: object, digits: int) -> object:
+    return f"{value:.{digits}g}" if isinstance(value, float) else value
 
 
 def _cell(value: object) -> str:
