@@ -88,6 +88,19 @@ def require_film(folder, *options):
         assert len(pictures.convert("RGB").getcolors(10**6)) > 50
 
 
+def test_the_guides_benchmark_trains_in_both_stages_and_is_reported(command, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(GUIDE)
+    words = ("--config-dir", GUIDE / "own", "benchmark=cheetah", "method=mcp", "seed=0", f"run_root={tmp_path}")
+    outcome = command("train", *words, *SHORT, cwd=tmp_path)
+    assert not outcome.returncode, outcome.stderr
+    (pretraining, transfer) = cells(find_runs([tmp_path])[0])
+    assert {pretraining.stage, transfer.stage} == {"pretrain", "transfer"}
+    for cell in (pretraining, transfer):
+        assert cell.place == ("gymnasium", "cheetah:CheetahSpeeds-v0")
+        assert cell.metrics["speed_error"] > 0
+        assert int(rows(cell.runs[0].path)[-1]["frames"]) == 256
+
+
 def test_tasks_of_the_control_suite_train_in_both_stages_and_are_filmed(train, command):
     pytest.importorskip("dm_control", reason="dm_control is not installed: pip install dm_control")
     folders = train("walker.make", f"+task.{{stage}}.max_episode_steps={STEPS}")
