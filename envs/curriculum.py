@@ -15,8 +15,8 @@ class Weighted(TypedDict, total=False):
     weight: Positive
 
 
+# Ranges of a task by name, and a weight
 Alternative = Annotated[Mapping[str, Any], Weighted, Mapping[str, Range]]
-"""Ranges of a task by name, and a weight."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
 from torchrl_mcp.values import Count, Positive, checked
 
+# MuJoCo's cones of contact forces
 Cone = Literal["pyramidal", "elliptic"]
-"""MuJoCo's cones of contact forces."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 

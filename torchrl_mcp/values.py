@@ -76,7 +76,7 @@ def _is_range(value: Any) -> bool:
 
 
 SEEDS = 2**32
-"""Finite of seeds that all random generators accept."""
+"""Number of seeds that all random generators accept."""
 
 Count = Annotated[int, Rule("a whole number, at least 1", lambda value: is_whole(value) and value >= 1)]
 Whole = Annotated[int, Rule("a whole number, at least 0", lambda value: is_whole(value) and value >= 0)]
@@ -87,6 +87,7 @@ NotNegative = Annotated[float, Rule("a finite number, at least 0", lambda value:
 Share = Annotated[float, Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value <= 1)]
 Discount = Annotated[float, Rule("a number from 0 to 1, below 1", lambda value: is_number(value) and 0 <= value < 1)]
 Probability = Annotated[float, Rule("a number between 0 and 1", lambda value: is_number(value) and 0 < value < 1)]
+# A time between events or a number of inputs; infinite for none
 Period = Annotated[
     float,
     Rule(
@@ -94,9 +95,8 @@ Period = Annotated[
         lambda value: isinstance(value, Real) and not isinstance(value, bool) and value > 0,
     ),
 ]
-"""A time between events, or a number of inputs; infinite for none."""
-
 Text = Annotated[str, Rule("a text", lambda value: isinstance(value, str) and bool(value))]
+# Units of hidden layers
 Widths = Annotated[
     Sequence[int],
     Rule(
@@ -104,8 +104,6 @@ Widths = Annotated[
         lambda value: is_list(value, lambda item: is_whole(item) and item >= 1) and len(value) > 0,
     ),
 ]
-"""Units of hidden layers."""
-
 Weights = Annotated[
     Sequence[float],
     Rule(

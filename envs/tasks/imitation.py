@@ -29,11 +29,11 @@ from torchrl_mcp.values import Count, Period, Positive, checked
 NUM_TARGETS = 2
 """Number of future states of the reference in the goal (section 4)."""
 
+# Clips to which the reference may jump
 Switch = Literal["any", "same"]
-"""Clips to which the reference may jump."""
 
+# What the end of a clip may do
 ClipEnd = Literal["truncate", "switch"]
-"""What the end of a clip may do."""
 
 
 class Imitation(PDCharacterEnv):

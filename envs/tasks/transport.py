@@ -22,8 +22,8 @@ from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
 from torchrl_mcp.values import Count, Positive, Range, checked
 
+# Forms of the horizontal positions in a goal
 Positions = Literal["metres", "logarithmic"]
-"""Forms of the horizontal positions in a goal."""
 
 POSITION_UNIT = f"{LOGARITHMIC}; height in m"
 """Unit of a logarithmic position of an object."""

@@ -27,11 +27,11 @@ CONTROL_TIMESTEP = 0.05
 """Seconds of a step of environments that do not say how long it is; only films show it."""
 
 
+# Keys of observations, of which nested keys are lists of names
 Keys = Annotated[
     Sequence[NestedKey],
     Rule("a list of names", lambda value: is_list(value, lambda item: is_list(item, _is_name) or _is_name(item))),
 ]
-"""Keys of observations, of which nested keys are lists of names."""
 
 
 def _is_name(value: Any) -> bool:

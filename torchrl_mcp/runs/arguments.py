@@ -23,7 +23,7 @@ def arguments(name: str) -> dict[str, inspect.Parameter]:
     Args:
         name: Dotted name of the class or function.
     """
-    signatures = [inspect.signature(_function(called)).parameters for called in _called(name)]
+    signatures = [_parameters(called) for called in _called(name)]
     parameters = {name: parameter for signature in reversed(signatures) for name, parameter in signature.items()}
     if is_open(signatures[-1]):
         return parameters
@@ -56,13 +56,20 @@ def _called(name: str) -> list[Any]:
     for base in target.__mro__:
         if "__init__" in vars(base):
             constructed.append(base)
-            if not is_open(inspect.signature(_function(base)).parameters):
+            if not is_open(_parameters(base)):
                 break
     return constructed
 
 
 def _function(called: Any) -> Any:
     return vars(called)["__init__"] if inspect.isclass(called) else called
+
+
+def _parameters(called: Any) -> Mapping[str, inspect.Parameter]:
+    try:
+        return inspect.signature(_function(called)).parameters
+    except ValueError:  # functions in C have no signature
+        return {}
 
 
 def is_open(parameters: Mapping[str, inspect.Parameter]) -> bool:
@@ -132,6 +139,6 @@ def exists(name: str) -> bool:
     """Return whether Python finds a class or function."""
     try:
         pkgutil.resolve_name(name)
-    except (ImportError, AttributeError, ValueError):
+    except (ImportError, AttributeError, SyntaxError, ValueError):
         return False
     return True

@@ -30,28 +30,21 @@ from torchrl_mcp.values import (
 
 
 class Stage(TypedDict):
-    """``stage``."""
+    """The group ``stage``."""
 
     gamma: Discount
 
 
 class Character(TypedDict):
-    """``character``."""
+    """The group ``character``."""
 
     action_std: Positive
     motion_starts: NotNegative
     near_objects: Range
 
 
-class Method(TypedDict):
-    """``method``; ``paper`` has step sizes by stage and character."""
-
-    paper: Mapping[str, Count | Mapping[str, Mapping[str, Positive]]]
-    standard: Mapping[str, Count | Text]
-
-
 class Task(TypedDict):
-    """``task``, without the groups of arguments of its environments, which :func:`.settings_of` adds."""
+    """The group ``task``, without the groups of arguments of its environments, which :func:`.settings_of` adds."""
 
     curriculum: Curriculum
     directions: Mapping[str, Range]
@@ -62,7 +55,7 @@ class Task(TypedDict):
 
 
 class StepSize(TypedDict):
-    """``step_size``."""
+    """The group ``step_size``."""
 
     actor: Positive
     max: Positive
@@ -72,7 +65,7 @@ class StepSize(TypedDict):
 
 
 class Objective(TypedDict):
-    """``objective``, or its part for one stage."""
+    """The group ``objective``, or its part for one stage."""
 
     max_grad_norm: Positive | None
     pretrain: "Objective"
@@ -80,7 +73,7 @@ class Objective(TypedDict):
 
 
 class Transfer(TypedDict):
-    """``transfer``."""
+    """The group ``transfer``."""
 
     keep: Names
     freeze: Names
@@ -89,14 +82,14 @@ class Transfer(TypedDict):
 
 
 class Evaluation(TypedDict):
-    """``evaluation``, without the arguments of the environments."""
+    """The group ``evaluation``, without the arguments of the environments."""
 
     episodes: Whole
     seed: Seed
 
 
 class Exploration(TypedDict):
-    """``exploration``."""
+    """The group ``exploration``."""
 
     action_noise: bool
     bound_coeff: NotNegative
@@ -105,50 +98,34 @@ class Exploration(TypedDict):
 
 
 class CurriculumChoice(TypedDict):
-    """``curriculum``."""
+    """The group ``curriculum``."""
 
     aids: Curriculum | None
 
 
 class Primitives(TypedDict):
-    """``primitives``."""
+    """The group ``primitives``."""
 
     initial_std: Positive
 
 
 class Physics(TypedDict):
-    """``physics``."""
+    """The group ``physics``."""
 
     on_device: bool
 
 
-class Hierarchy(TypedDict):
-    """A stage of ``hierarchy``."""
-
-    batch_factor: Count
-
-
-class Goal(TypedDict):
-    """An entry of ``goal``."""
-
-    blind: Mapping[str, bool]
-    keep: Names
-
-
-class Demo(TypedDict):
-    """``demo``."""
-
-    minutes: Positive
-    seconds: Positive
-
-
 class RunSettings(TypedDict):
-    """All settings of a run. A group that is not declared as optional must be in every configuration."""
+    """All settings of a run. A group that is not declared as optional must be in every configuration.
+
+    Tables from which a method, a stage or a task chooses a setting, such as ``budget``, are not declared, because the
+    chosen setting is checked.
+    """
 
     task: Task
     stage: Stage
     character: Character
-    method: Method
+    method: Mapping[str, Any]
     training: PPOSettings
     step_size: StepSize
     evaluation: Evaluation
@@ -159,10 +136,6 @@ class RunSettings(TypedDict):
     curriculum: CurriculumChoice | None
     primitives: Primitives | None
     physics: Physics | None
-    hierarchy: Mapping[str, Hierarchy] | None
-    goal: Mapping[str, Goal] | None
-    budget: Mapping[str, Count | Mapping[str, Count]] | None
-    demo: Demo | None
 
     seed: Seed
     device: Text

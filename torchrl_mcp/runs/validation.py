@@ -75,7 +75,7 @@ def types_of_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     stage = config.get("stage")
     chosen = task.get(stage.get("name")) if isinstance(task, Mapping) and isinstance(stage, Mapping) else None
     target = chosen.get("_target_") if isinstance(chosen, Mapping) else None
-    environment = argument_types(target) if target else {}
+    environment = argument_types(str(target)) if target else {}
     stages = dict.fromkeys(("pretrain", "transfer", "evaluation"), environment)
     return {
         **types_of(RunSettings),
@@ -125,7 +125,7 @@ def _types_of_target(group: Mapping[str, Any]) -> dict[str, Any]:
     """Return the types of the arguments in a group with ``_target_``."""
     values = [value for name, value in group.items() if name not in ("_target_", "_partial_")]
     # An object without values, such as the recorder of a run without recordings, is not worth its import.
-    return {} if all(value is None for value in values) else argument_types(group["_target_"])
+    return {} if all(value is None for value in values) else argument_types(str(group["_target_"]))
 
 
 def _step_size_out_of_range(actor: float, schedule: Mapping[str, Any]) -> Iterator[str]:
