@@ -44,7 +44,7 @@ class Character(TypedDict):
 
 
 class Task(TypedDict):
-    """The group ``task``, without the groups of arguments of its environments, which :func:`.settings_of` adds."""
+    """The group ``task``, without the groups of arguments of its environments."""
 
     curriculum: Curriculum
     directions: Mapping[str, Range]

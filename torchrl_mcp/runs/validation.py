@@ -58,9 +58,10 @@ def require_values(task: Mapping[str, Any], given: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If values are wrong; the message gives the name, the value and the rule of each.
     """
-    objects = {name: value for name, value in task.items() if isinstance(value, Mapping) and "_target_" in value}
     types = argument_types(task["_target_"])
-    types |= {name: argument_types(value["_target_"]) for name, value in objects.items()}
+    for name in given:
+        if isinstance(given[name], Mapping) and isinstance(task.get(name), Mapping) and "_target_" in task[name]:
+            types[name] = argument_types(task[name]["_target_"])
     if wrong := list(wrong_values(given, types)):
         raise ValueError("\n".join(wrong))
 
