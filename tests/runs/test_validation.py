@@ -82,7 +82,7 @@ WRONG = {
     "stage.gamma": ["1", "2", "-0.1", "nan", "null"],
     "objective.advantages.lmbda": ["1.5", "-1"],
     "objective.advantages.clip": ["0", "-4"],
-    "objective.max_grad_norm": ["-1", "0", "nan"],
+    "objective.max_grad_norm": ["-1", "0", ".nan", ".inf"],
     "objective.loss.clip_epsilon": ["-1", "0", "wide"],
     "objective.loss.bound_coeff": ["-1"],
     "optimizer.actor.lr": ["0", "-1e-3", "nan", "fast"],
