@@ -141,7 +141,7 @@ FAULTS = {
     ],
     "torchrl_mcp/methods/latent_space.py": [
         ("if random else torch.zeros_like(loc)", "if random else torch.ones_like(loc)", "methods/test_latent_space.py"),
-        ("@checked\n", "", "methods/test_latent_space.py"),
+        ("@checked\ndef latent_parts", "def latent_parts", "methods/test_latent_space.py"),
     ],
     "torchrl_mcp/methods/transforms.py": [
         ("steps.masked_fill(begins, 0) + 1", "steps + 1", "methods/test_transforms.py"),
@@ -160,7 +160,7 @@ FAULTS = {
         ("& ~after", "& after", "objectives/test_advantages.py"),
         ("return 1 - gamma", "return 1.0", "objectives/test_advantages.py"),
         (".clamp(-clip, clip)", "", "objectives/test_advantages.py"),
-        ("if not 0 <= gamma < 1", "if not 0 <= gamma <= 1", "objectives/test_advantages.py"),
+        ("@checked\n", "", "objectives/test_advantages.py"),
     ],
     "torchrl_mcp/objectives/latent.py": [("prior).sum(-1)", "prior).mean(-1)", "objectives/test_latent.py")],
     "torchrl_mcp/objectives/option_critic.py": [

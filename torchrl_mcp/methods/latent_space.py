@@ -111,6 +111,7 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
     return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
 
 
+@checked
 def latents_actor(parts: nn.ModuleDict, *, latent_std: Positive | None = None, frozen: Collection[str] = ()) -> Actor:
     r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
 

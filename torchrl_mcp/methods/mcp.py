@@ -170,6 +170,7 @@ def composite_actor(
     return Actor(policy, trained, stored=("gates", *PRIMITIVES))
 
 
+@checked
 def weights_actor(
     parts: nn.ModuleDict,
     *,
@@ -265,11 +266,9 @@ def random_weights(
 class ConstantScale(nn.Module):
     """A standard deviation that does not depend on the input."""
 
-    def __init__(self, std: float) -> None:
-        """Set the standard deviation, which must be positive."""
+    def __init__(self, std: Positive) -> None:
+        """Set the standard deviation."""
         super().__init__()
-        if not std > 0:
-            raise ValueError(f"logits_std must be positive, got {std}")
         self.std = std
 
     def forward(self, loc: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_mcp.values import Count, NotNegative, Positive, Widths
+from torchrl_mcp.values import Count, NotNegative, Positive, Widths, checked
 
 
 class Gating(nn.Module):
@@ -109,14 +109,13 @@ class JointGating(nn.Module):
         return at_least_single(self.output(self.body(observation, goal)))
 
 
+@checked
 def scaled_cells(num_cells: Widths, width: Positive) -> list[int]:
     """Return numbers of hidden units times ``width``, rounded.
 
     Raises:
         ValueError: If ``num_cells`` is not a list of layers, or a layer would have no units.
     """
-    if isinstance(num_cells, int) or not num_cells:
-        raise ValueError(f"num_cells={num_cells} must be a list with the units of one layer or more, such as [64]")
     scaled = [round(cells * width) for cells in num_cells]
     if min(scaled) < 1:
         raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")

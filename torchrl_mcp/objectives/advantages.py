@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
-from torchrl_mcp.values import Discount, Positive, Share
+from torchrl_mcp.values import Discount, Positive, Share, checked
 
 
 class Advantages:
@@ -115,12 +115,11 @@ def normalised(advantage: Tensor, clip: Positive) -> Tensor:
     return ((advantage - advantage.mean()) / deviation.clamp_min(1e-8)).clamp(-clip, clip)
 
 
+@checked
 def reward_scale(gamma: Discount) -> float:
     r"""Return the factor on rewards that gives returns the size of a reward, :math:`1 - \gamma`.
 
     Raises:
         ValueError: If ``gamma`` is not at least 0 and below 1: at 1 all rewards would be 0.
     """
-    if not 0 <= gamma < 1:
-        raise ValueError(f"gamma={gamma} must be at least 0 and below 1: rewards are scaled by 1 - gamma")
     return 1 - gamma
