@@ -18,6 +18,7 @@ from torchrl_mcp.envs.physics.engines import Engine, named
 from torchrl_mcp.envs.physics.simulation import LARGEST
 from torchrl_mcp.envs.rendering.camera import Arrow, Camera
 from torchrl_mcp.envs.steering import Steerable, UserGoal
+from torchrl_mcp.values import Count, Whole, checked
 
 ALL = slice(None)
 """Index of all simulations that makes no copy."""
@@ -92,33 +93,26 @@ class CharacterEnv(EnvBase):
     batch_locked = True
     _supports_set_state = True
 
+    @checked
     def __init__(
         self,
         model: mujoco.MjModel,
-        num_envs: int,
+        num_envs: Count,
         *,
-        substeps: int,
-        max_episode_steps: int,
+        substeps: Count,
+        max_episode_steps: Count,
         episode: Mapping[str, Tensor] = MappingProxyType({}),
         outputs: Sequence[str] = (),
         model_fields: Sequence[str] = (),
         physics: str | Engine = "mujoco",
         device: torch.device | str = "cpu",
         seed: int | None = None,
-        num_threads: int = 0,
+        num_threads: Whole = 0,
         persistent: bool = False,
         current: bool = False,
         dtype: torch.dtype = torch.float32,
         pin_memory: bool = False,
     ) -> None:
-        counts = [
-            ("num_envs", num_envs, 1),
-            ("max_episode_steps", max_episode_steps, 1),
-            ("num_threads", num_threads, 0),
-        ]
-        for name, value, least in counts:
-            if value < least:
-                raise ValueError(f"{name}={value} is too small: pass at least {least}")
         if pin_memory and not torch.cuda.is_available():
             raise ValueError("pin_memory=True needs a CUDA device, but none is available: pass False")
         super().__init__(device=torch.device(device), batch_size=[num_envs])

@@ -2,10 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any, Literal, TypedDict
 
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.library import MotionLibrary
+from torchrl_mcp.values import NotNegative, Positive, Range, Share, Weights
+
+
+class Weighted(TypedDict, total=False):
+    """The weight of an alternative."""
+
+    weight: Positive
+
+
+# Ranges of a task by name, and a weight
+Alternative = Annotated[Mapping[str, Any], Weighted, Mapping[str, Range]]
 
 
 @dataclass(frozen=True)
@@ -40,13 +51,13 @@ class Curriculum:
         torch.Size([4, 3, 1])
     """
 
-    initial_states: str | Mapping[str, float] = "rest"
+    initial_states: Literal["rest", "motions"] | Mapping[str, NotNegative] = "rest"
     motions: MotionLibrary | Mapping[str, MotionClip] | None = None
-    mixture: Sequence[Mapping[str, Any]] = ()
-    reward_weights: Sequence[float] | None = None
-    target_distance_power: float = 1
+    mixture: Sequence[Alternative] = ()
+    reward_weights: Weights | None = None
+    target_distance_power: NotNegative = 1
     random_first_length: bool = False
-    discount: float = 0.99
+    discount: Share = 0.99
 
     def __post_init__(self) -> None:
         if not 0 < self.discount <= 1:

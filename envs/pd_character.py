@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import torch
@@ -23,6 +23,10 @@ from torchrl_mcp.envs.observations import UNITS, character_state, state_layout
 from torchrl_mcp.envs.physics.arrays import as_array, as_tensor, by_component, contiguous, converted
 from torchrl_mcp.envs.rendering.ground import add_ground
 from torchrl_mcp.envs.rotations import heading
+from torchrl_mcp.values import Count, Positive, checked
+
+# MuJoCo's cones of contact forces
+Cone = Literal["pyramidal", "elliptic"]
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
@@ -88,18 +92,19 @@ class PDCharacterEnv(CharacterEnv):
 
     units: Mapping[str, str] = MappingProxyType(UNITS)
 
+    @checked
     def __init__(
         self,
         character: str,
-        num_envs: int,
+        num_envs: Count,
         *,
-        max_episode_steps: int,
+        max_episode_steps: Count,
         episode: Mapping[str, Tensor] = MappingProxyType({}),
         curriculum: Curriculum | Mapping[str, Any] | None = None,
         furnish: Callable[[mujoco.MjSpec], None] = lambda spec: None,
-        physics_timestep: float | None = None,
+        physics_timestep: Positive | None = None,
         self_collision: bool = False,
-        friction_cone: str = "pyramidal",
+        friction_cone: Cone = "pyramidal",
         terminate_on_fall: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -115,8 +120,6 @@ class PDCharacterEnv(CharacterEnv):
             )
         spec = self.character.spec(self_collision=self_collision)
         self._bodies = [body.name for body in spec.bodies[1:]]
-        if friction_cone not in CONES:
-            raise ValueError(f"friction_cone={friction_cone!r} is unknown: pass one of {', '.join(CONES)}")
         spec.option.cone = CONES[friction_cone]
         add_ground(spec)
         furnish(spec)

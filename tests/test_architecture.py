@@ -26,9 +26,11 @@ ORDER = (
 """Folders of ``torchrl_mcp``, of which each may import those before it."""
 CONTRACT = "torchrl_mcp.adapters.contract"
 """Between environments and all that uses them."""
+VALUES = "torchrl_mcp.values"
+"""The types with rules, which every folder may import, and which imports none."""
 RANKS = {folder: rank for rank, folders in enumerate(ORDER) for folder in folders}
 ROOMS = (
-    {"arguments", "rotations"},
+    {"rotations"},
     {"physics"},
     {"characters"},
     {"rendering"},
@@ -78,7 +80,11 @@ IMPORTS = {name: set(imports(name)) for name in MODULES}
 
 
 def test_every_folder_has_its_place():
-    assert {folder(name) for name in MODULES} - {None} == set(RANKS) | {"envs"}
+    assert {folder(name) for name in MODULES if name != VALUES} - {None} == set(RANKS) | {"envs"}
+
+
+def test_the_types_with_rules_need_the_standard_library_alone():
+    assert {name.split(".")[0] for name in IMPORTS[VALUES]} <= sys.stdlib_module_names
 
 
 @pytest.mark.parametrize("name", sorted(RANKS))
@@ -93,7 +99,7 @@ def test_a_folder_imports_none_that_builds_on_it(name):
 def test_environments_know_nothing_of_what_learns():
     for module in MODULES:
         if folder(module) == "envs":
-            ours = {other for other in IMPORTS[module] if other.startswith("torchrl_mcp")} - {CONTRACT}
+            ours = {other for other in IMPORTS[module] if other.startswith("torchrl_mcp")} - {CONTRACT, VALUES}
             assert all(folder(other) == "envs" for other in ours), f"{module} imports {ours}"
 
 

@@ -9,7 +9,7 @@ from refusals import refused
 
 from torchrl_mcp import conf
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.runs.requirements import require_environment
+from torchrl_mcp.runs.imports import require_environment
 
 CONF = Path(conf.__file__).parent
 METHODS, CHARACTERS, STAGES = (

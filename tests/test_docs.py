@@ -18,7 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.report.paper import TABLE_2
-from torchrl_mcp.runs import build, requirements
+from torchrl_mcp.runs import arguments as taken
+from torchrl_mcp.runs import build
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -149,7 +150,7 @@ def exists(cfg, name):
         return False
     if not name.startswith("+"):
         return last in parent
-    return last not in parent and "_target_" in parent and last in requirements.arguments(parent._target_)
+    return last not in parent and "_target_" in parent and last in taken.arguments(parent._target_)
 
 
 @pytest.mark.parametrize("page", pages_with(INCLUDE), ids=lambda path: path.stem)

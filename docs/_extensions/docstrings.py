@@ -2,8 +2,9 @@
 
 import inspect
 import re
+from contextlib import suppress
 from itertools import groupby
-from typing import Any
+from typing import Any, get_type_hints
 
 from docutils import nodes
 from sphinx.application import Sphinx
@@ -15,6 +16,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Prepare docstrings before they are parsed."""
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-docstring", prepare, priority=BEFORE_NAPOLEON)
+    app.connect("autodoc-before-process-signature", plain_types)
     app.connect("autodoc-process-signature", constructor)
     app.connect("doctree-read", without_object)
     return {"parallel_read_safe": True}
@@ -33,6 +35,14 @@ def prepare(app: Sphinx, what: str, name: str, obj: object, options: object, lin
         block = list(group)
         converted += list_table(block) if is_table else block
     lines[:] = converted
+
+
+def plain_types(app: Sphinx, obj: object, bound_method: bool) -> None:
+    """Leave out the rules in the types of parameters, whose words Sphinx would take for names."""
+    for function in (obj, inspect.unwrap(obj)) if callable(obj) else ():
+        if inspect.isfunction(function):
+            with suppress(NameError, TypeError):
+                function.__annotations__ = get_type_hints(function)
 
 
 def constructor(

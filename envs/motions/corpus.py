@@ -8,11 +8,12 @@ from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.corpus import walking_corpus
 from torchrl_mcp.envs.motions.library import MotionLibrary
 from torchrl_mcp.envs.motions.trex import trex_corpus
+from torchrl_mcp.values import Seed
 
 TREX_CLIPS = ("straight", "left_gentle", "left_sharp", "right_gentle", "right_sharp")
 
 
-def generated_library(character: str, seed: int) -> MotionLibrary:
+def generated_library(character: str, seed: Seed) -> MotionLibrary:
     """Return the generated corpus of a character: walking and turning, 230 s for biped and humanoid, 11 s for T-Rex.
 
     Args:

@@ -25,6 +25,7 @@ from torchrl_mcp.envs.tasks.tables import (
 )
 from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.envs.tasks.waypoints import carry_waypoint, place_seen
+from torchrl_mcp.values import Count
 
 RESTING_GAP = 0.01
 """Largest distance in metres between box and top at which the box stands on the top."""
@@ -87,7 +88,7 @@ class Carry(Transport):
     proximity_scale = 0.25
     success_distance = TOP_HALF_SIZE
 
-    def __init__(self, character: str, num_envs: int, **kwargs: Any) -> None:
+    def __init__(self, character: str, num_envs: Count, **kwargs: Any) -> None:
         super().__init__(
             character,
             num_envs,

@@ -1,7 +1,7 @@
 """The dribble task: move a ball to a target with the feet."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import mujoco
@@ -13,6 +13,7 @@ from torchrl_mcp.envs.tasks.places import near
 from torchrl_mcp.envs.tasks.rewards import SUCCESS_DISTANCE, SUCCESS_REACH
 from torchrl_mcp.envs.tasks.transport import Transport
 from torchrl_mcp.envs.tasks.waypoints import dribble_waypoint, place_seen
+from torchrl_mcp.values import Count, Range
 
 # Radius, mass, friction and damping of the ball are from the same authors' public code.
 RADIUS = 0.2
@@ -79,7 +80,7 @@ class Dribble(Transport):
     success_reach = SUCCESS_REACH
 
     def __init__(
-        self, character: str, num_envs: int, *, object_distances: Sequence[float] = (0.5, 10.0), **kwargs: Any
+        self, character: str, num_envs: Count, *, object_distances: Range = (0.5, 10.0), **kwargs: Any
     ) -> None:
         super().__init__(character, num_envs, furnish=add_pitch, object_distances=object_distances, **kwargs)
         poses = self.initial_states.poses()

@@ -1,6 +1,5 @@
 """The heading task: walk in a direction that keeps changing, and optionally at changing speeds."""
 
-from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -8,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
-from torchrl_mcp.envs.arguments import interval, not_negative, positive
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import UNITS
@@ -20,6 +18,7 @@ from torchrl_mcp.envs.tasks.places import LOGARITHMIC
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
+from torchrl_mcp.values import Count, NotNegative, Period, Range, Speed, checked
 
 
 class Heading(PDCharacterEnv):
@@ -64,24 +63,22 @@ class Heading(PDCharacterEnv):
 
     units = MappingProxyType({**UNITS, "direction": "unit vector", "speed": "m/s", "waypoint": LOGARITHMIC})
 
+    @checked
     def __init__(
         self,
         character: str,
-        num_envs: int,
+        num_envs: Count,
         *,
-        max_turn: float = 0.15,
-        speed: float | Sequence[float] = 1.0,
-        speed_interval: float = 3.0,
+        max_turn: NotNegative = 0.15,
+        speed: Speed = 1.0,
+        speed_interval: Period = 3.0,
         waypoint: bool = False,
-        initial_directions: Sequence[float] = (0.0, 0.0),
-        max_episode_steps: int = 600,
+        initial_directions: Range = (0.0, 0.0),
+        max_episode_steps: Count = 600,
         **kwargs: Any,
     ) -> None:
-        not_negative(max_turn=max_turn)
-        if not speed_interval > 0:
-            raise ValueError(f"speed_interval={speed_interval} is out of range: pass seconds, or inf for no changes")
         self.max_turn = max_turn
-        self.speeds = _speeds(speed)
+        self.speeds = (speed, speed) if isinstance(speed, int | float) else (float(speed[0]), float(speed[1]))
         self.waypoint = waypoint
         shown = 3 if self.changes_speed else 2
         self.goal_layout = {"direction": slice(0, 2)}
@@ -194,11 +191,3 @@ class Heading(PDCharacterEnv):
     def _target_velocity(self) -> Tensor:
         """The target direction times the target speed, ``(N, 2)``, in m/s."""
         return unit_vector(self.episode["direction"]) * self.episode["speed"].unsqueeze(-1)
-
-
-def _speeds(speed: float | Sequence[float]) -> tuple[float, float]:
-    """Bounds of a range of speeds, which are equal for a single one."""
-    low, high = (speed, speed) if isinstance(speed, int | float) else interval("speed", speed)
-    not_negative(speed=low)
-    positive(speed=high)
-    return low, high

@@ -1,6 +1,5 @@
 """The holdout task: an ant runs in directions that pre-training held out."""
 
-from collections.abc import Sequence
 from functools import partial
 from itertools import accumulate
 from types import MappingProxyType
@@ -12,12 +11,12 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
-from torchrl_mcp.envs.arguments import interval, not_negative
 from torchrl_mcp.envs.base import CharacterEnv
 from torchrl_mcp.envs.characters import ant
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.tasks.rewards import holdout_reward
+from torchrl_mcp.values import Count, NotNegative, Range, checked
 
 # Ant-v5's frame_skip, main_body and contact_force_range.
 SUBSTEPS = 5
@@ -81,32 +80,24 @@ class Holdout(CharacterEnv):
         }
     )
 
+    @checked
     def __init__(
         self,
-        num_envs: int,
-        directions: Sequence[float],
+        num_envs: Count,
+        directions: Range,
         *,
-        max_episode_steps: int = 1000,
+        max_episode_steps: Count = 1000,
         contact_forces: bool = False,
-        forward_weight: float = 1.0,
-        healthy_weight: float = 1.0,
-        control_weight: float = 0.5,
-        contact_weight: float = 0.0005,
-        healthy_z_range: Sequence[float] = (0.2, 1.0),
+        forward_weight: NotNegative = 1.0,
+        healthy_weight: NotNegative = 1.0,
+        control_weight: NotNegative = 0.5,
+        contact_weight: NotNegative = 0.0005,
+        healthy_z_range: Range = (0.2, 1.0),
         terminate_when_unhealthy: bool = True,
-        reset_noise_scale: float = 0.1,
+        reset_noise_scale: NotNegative = 0.1,
         dtype: torch.dtype = torch.float32,
         **kwargs: Any,
     ) -> None:
-        directions = interval("directions", directions)
-        healthy_z_range = interval("healthy_z_range", healthy_z_range)
-        not_negative(
-            forward_weight=forward_weight,
-            healthy_weight=healthy_weight,
-            control_weight=control_weight,
-            contact_weight=contact_weight,
-            reset_noise_scale=reset_noise_scale,
-        )
         spec = ant()
         model = spec.compile()
         self.scene = spec.to_xml()
@@ -124,9 +115,9 @@ class Holdout(CharacterEnv):
             dtype=dtype,
             **kwargs,
         )
-        self.directions = directions
+        self.directions = float(directions[0]), float(directions[1])
         self.reset_noise_scale = reset_noise_scale
-        self.healthy_z_range = healthy_z_range
+        self.healthy_z_range = float(healthy_z_range[0]), float(healthy_z_range[1])
         self.terminate_when_unhealthy = terminate_when_unhealthy
         self._reward_of = partial(
             holdout_reward,

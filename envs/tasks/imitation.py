@@ -1,12 +1,11 @@
 """The imitation task, for pre-training primitives: follow reference motions."""
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
 from torchrl_mcp.envs.characters.joints import joint_layout
@@ -18,21 +17,23 @@ from torchrl_mcp.envs.observations import bodies_in_heading_frame, bodies_layout
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
 from torchrl_mcp.envs.rotations import rotate
 from torchrl_mcp.envs.tasks.imitation_reward import (
+    Term,
     checked_terms,
     imitation_rewards,
     mismatch,
     squared_angles,
     squared_distances,
 )
+from torchrl_mcp.values import Count, Period, Positive, checked
 
 NUM_TARGETS = 2
 """Number of future states of the reference in the goal (section 4)."""
 
-SWITCHES = ("any", "same")
-"""Clips to which the reference may jump."""
+# Clips to which the reference may jump
+Switch = Literal["any", "same"]
 
-CLIP_ENDS = ("truncate", "switch")
-"""What the end of a clip may do."""
+# What the end of a clip may do
+ClipEnd = Literal["truncate", "switch"]
 
 
 class Imitation(PDCharacterEnv):
@@ -103,19 +104,20 @@ class Imitation(PDCharacterEnv):
 
     _next: PlacedMotion  # states of the references after the next step
 
+    @checked
     def __init__(
         self,
         character: str,
         clips: MotionLibrary | Mapping[str, MotionClip],
-        num_envs: int,
+        num_envs: Count,
         *,
-        terms: Mapping[str, Mapping[str, float]],
-        max_error: float = 0.3,
-        switch_interval: float = 5.0,
-        switch_candidates: int = 1,
-        switch_to: str = "any",
-        clip_end: str = "truncate",
-        max_episode_steps: int = 300,
+        terms: Mapping[str, Annotated[Mapping[str, float], Term]],
+        max_error: Positive = 0.3,
+        switch_interval: Period = 5.0,
+        switch_candidates: Count = 1,
+        switch_to: Switch = "any",
+        clip_end: ClipEnd = "truncate",
+        max_episode_steps: Count = 300,
         **kwargs: Any,
     ) -> None:
         if not isinstance(clips, MotionLibrary | Mapping):
@@ -126,15 +128,6 @@ class Imitation(PDCharacterEnv):
         library = clips if isinstance(clips, MotionLibrary) else MotionLibrary(clips)
         if library.character != character:
             raise ValueError(f"clips are of {library.character}: pass motions of character={character!r}")
-        positive(max_error=max_error)
-        if not switch_interval > 0:
-            raise ValueError(f"switch_interval={switch_interval} is out of range: pass seconds, or inf for no switches")
-        if switch_candidates < 1:
-            raise ValueError(f"switch_candidates={switch_candidates} is out of range: pass at least 1")
-        if switch_to not in SWITCHES:
-            raise ValueError(f"switch_to={switch_to!r} is unknown: pass {' or '.join(SWITCHES)}")
-        if clip_end not in CLIP_ENDS:
-            raise ValueError(f"clip_end={clip_end!r} is unknown: pass {' or '.join(CLIP_ENDS)}")
         self.max_error = max_error
         self.clip_end = clip_end
         self.terms = checked_terms(terms)

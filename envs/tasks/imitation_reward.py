@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.characters.kinematics import BodyStates
+from torchrl_mcp.values import NotNegative, Positive, require, types_of
 
 HORIZON = 0.25
 """Seconds by which velocities are multiplied, to compare them with positions."""
@@ -28,8 +28,8 @@ ERRORS = (
 class Term(NamedTuple):
     r"""A term of the imitation reward, :math:`w \exp(-c \, e)` of an error :math:`e`."""
 
-    weight: float
-    scale: float
+    weight: Positive
+    scale: NotNegative
 
 
 def checked_terms(terms: Mapping[str, Mapping[str, float]]) -> dict[str, Term]:
@@ -45,8 +45,8 @@ def checked_terms(terms: Mapping[str, Mapping[str, float]]) -> dict[str, Term]:
             raise ValueError(f"terms names {name!r}, which is not an error: pass some of {', '.join(ERRORS)}")
         if set(term) != set(Term._fields):
             raise ValueError(f"the term {name} has {', '.join(term) or 'nothing'}: pass {' and '.join(Term._fields)}")
-        positive(**{f"terms.{name}.weight": term["weight"]})
-        not_negative(**{f"terms.{name}.scale": term["scale"]})
+        for field, annotation in types_of(Term).items():
+            require(f"terms.{name}.{field}", term[field], annotation)
     return {name: Term(**term) for name, term in terms.items()}
 
 

@@ -1,7 +1,6 @@
 """The location task: go to a place and stand there, until another place is named."""
 
 import math
-from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -9,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
-from torchrl_mcp.envs.arguments import not_negative, positive
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
@@ -20,6 +18,7 @@ from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmi
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, walkable, way
+from torchrl_mcp.values import Count, NotNegative, Positive, Range, checked, require
 
 STANDING_SPEED = 0.1
 """Speed of the centre of mass in m/s below which a character stands."""
@@ -76,20 +75,20 @@ class Location(PDCharacterEnv):
 
     units = MappingProxyType({**UNITS, "place": LOGARITHMIC, "final_direction": "unit vector"})
 
+    @checked
     def __init__(
         self,
         character: str,
-        num_envs: int,
+        num_envs: Count,
         *,
-        target_distances: Sequence[float] = (0.0, 10.0),
-        target_directions: Sequence[float] = ANY_DIRECTION,
-        target_intervals: Sequence[float] = (3.0, 8.0),
-        final_directions: Sequence[float] | None = None,
-        speed: float = 1.0,
-        max_episode_steps: int = 600,
+        target_distances: Range = (0.0, 10.0),
+        target_directions: Range = ANY_DIRECTION,
+        target_intervals: Range = (3.0, 8.0),
+        final_directions: Range | None = None,
+        speed: Positive = 1.0,
+        max_episode_steps: Count = 600,
         **kwargs: Any,
     ) -> None:
-        positive(speed=speed)
         self.speed = speed
         self.faces = final_directions is not None
         self.goal_layout = {"place": slice(0, 2)}
@@ -110,7 +109,7 @@ class Location(PDCharacterEnv):
         self.ranges = Ranges(ranges, self.curriculum.mixture).to(self.device)
         self.ranges.require_distances("target_distances")
         shortest = self.ranges.lowest("target_intervals")
-        not_negative(target_intervals=shortest)
+        require("target_intervals", shortest, NotNegative)
         self.one_place = shortest >= max_episode_steps * self.control_timestep
         self._steered = False
         self.make_specs()

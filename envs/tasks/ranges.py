@@ -6,7 +6,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.arguments import interval
+from torchrl_mcp.values import Range, require
 
 
 class Ranges:
@@ -37,7 +37,10 @@ class Ranges:
             raise ValueError(f"mixture has weights {weights}: pass finite numbers above 0")
         self._names = list(ranges)
         complete = [{**ranges, **alternative} for alternative in alternatives]
-        pairs = [[interval(name, value) for name, value in alternative.items()] for alternative in complete]
+        for alternative in complete:
+            for name, bounds in alternative.items():
+                require(name, bounds, Range)
+        pairs = [[(float(low), float(high)) for low, high in alternative.values()] for alternative in complete]
         self._bounds = torch.tensor(pairs, dtype=torch.float64)  # (alternatives, names, 2)
         self._weights = torch.tensor(weights, dtype=torch.float64)
 

@@ -2,15 +2,14 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
-from torchrl_mcp.envs.arguments import positive
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.ideal import transport_reach
 from torchrl_mcp.envs.observations import SIZES, UNITS
@@ -21,9 +20,10 @@ from torchrl_mcp.envs.tasks.objects import SceneObject
 from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
+from torchrl_mcp.values import Count, Positive, Range, checked
 
-POSITIONS = ("metres", "logarithmic")
-"""Forms of the horizontal positions in a goal."""
+# Forms of the horizontal positions in a goal
+Positions = Literal["metres", "logarithmic"]
 
 POSITION_UNIT = f"{LOGARITHMIC}; height in m"
 """Unit of a logarithmic position of an object."""
@@ -84,28 +84,24 @@ class Transport(PDCharacterEnv):
     object: SceneObject
     target: SceneObject
 
+    @checked
     def __init__(
         self,
         character: str,
-        num_envs: int,
+        num_envs: Count,
         *,
-        object_distances: Sequence[float] = (0.0, 10.0),
-        object_directions: Sequence[float] = ANY_DIRECTION,
-        target_distances: Sequence[float] = (0.0, 10.0),
-        target_directions: Sequence[float] = ANY_DIRECTION,
-        speed: float = 1.0,
-        target_distance_power: float = 2,
+        object_distances: Range = (0.0, 10.0),
+        object_directions: Range = ANY_DIRECTION,
+        target_distances: Range = (0.0, 10.0),
+        target_directions: Range = ANY_DIRECTION,
+        speed: Positive = 1.0,
+        target_distance_power: Literal[1, 2] = 2,
         success_reward: bool = False,
-        goal_positions: str = "metres",
+        goal_positions: Positions = "metres",
         waypoint: bool = False,
-        max_episode_steps: int = 3000,
+        max_episode_steps: Count = 3000,
         **kwargs: Any,
     ) -> None:
-        positive(speed=speed)
-        if target_distance_power not in (1, 2):
-            raise ValueError(f"target_distance_power={target_distance_power} is out of range: pass 2 (paper) or 1")
-        if goal_positions not in POSITIONS:
-            raise ValueError(f"goal_positions={goal_positions!r} is unknown: pass {' or '.join(POSITIONS)}")
         self.speed = speed
         self.target_distance_power = target_distance_power
         self.success_reward = success_reward

@@ -80,7 +80,7 @@ def test_in_development_mode_a_command_ends_with_a_traceback(words, tmp_path):
         (["evaluate", "run", "--seed", "-1"], "--seed: '-1'"),
         (["evaluate", "run", "--episodes", "0"], "--episodes: '0'"),
         (["play", "run", "--viewer", "web", "--port", "70000"], "--port: '70000'"),
-        (["evaluate", "builtin:biped", "--task", "max_episode_steps=abc"], "--task max_episode_steps=abc"),
+        (["evaluate", "builtin:biped", "--task", "max_episode_steps=abc"], "max_episode_steps=abc"),
         (["evaluate", "builtin:biped", "--task", "speed=${"], "--task speed=${"),
         (["evaluate", "builtin:biped", "--task", "[=1"], "--task [=1"),
         (["evaluate", "builtin:biped-heading", "--task", "curriculum=none"], "curriculum=none"),

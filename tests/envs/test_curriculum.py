@@ -116,7 +116,7 @@ def test_standing_still_far_from_everything_earns_nothing():
         (Heading, {"discount": 0}, "discount=0"),
         (Heading, {"discount": 1.1}, "discount=1.1"),
         (Heading, {"emphasis": None}, "'emphasis'"),
-        (Heading, "none", "curriculum=none"),
+        (Heading, "none", "curriculum='none'"),
     ],
 )
 def test_a_wrong_curriculum_is_refused(task, curriculum, name):

@@ -7,7 +7,8 @@ import torch
 from omegaconf import OmegaConf
 
 from torchrl_mcp.evaluation.rollout import evaluate
-from torchrl_mcp.runs import build, requirements
+from torchrl_mcp.runs import arguments as called
+from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
 
 STAGES = {
@@ -106,7 +107,7 @@ def trained_otherwise(task):
 @every_task
 def test_an_evaluation_says_every_setting_of_its_environment(task):
     cfg = usual(task)
-    arguments = requirements.arguments(cfg.task[STAGES[task]]._target_)
+    arguments = called.arguments(cfg.task[STAGES[task]]._target_)
     inside = {
         "furnish",
         "episode",

@@ -4,9 +4,10 @@ import pytest
 from omegaconf import OmegaConf
 from refusals import refused
 
-from torchrl_mcp.runs import requirements
+from torchrl_mcp.runs.arguments import require_callable
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.runs.validation import require_used
+from torchrl_mcp.runs.imports import require_environment
+from torchrl_mcp.runs.names import require_used
 
 METHODS = ("mcp", "moe", "scratch", "finetune", "hierarchical", "option_critic", "latent_space")
 
@@ -18,7 +19,7 @@ def test_the_settings_of_the_library_are_all_used_and_its_arguments_taken(method
     cfg = compose_run(f"method={method}", f"task={task}", "run_dir=run", *others)
     require_used(cfg)
     if not others:
-        requirements.require_callable(OmegaConf.to_container(cfg, resolve=True))
+        require_callable(OmegaConf.to_container(cfg, resolve=True))
 
 
 @pytest.mark.parametrize(
@@ -60,13 +61,13 @@ def test_labels_and_settings_of_ones_own_are_allowed(settings):
 )
 def test_an_argument_that_a_class_does_not_take_is_named_with_the_nearest(setting, names):
     cfg = compose_run("task=heading", "stage=transfer", "run_dir=run", setting)
-    refused(lambda: requirements.require_callable(OmegaConf.to_container(cfg, resolve=True)), *names)
+    refused(lambda: require_callable(OmegaConf.to_container(cfg, resolve=True)), *names)
 
 
 def test_code_of_others_is_left_to_python():
-    requirements.require_callable({"activation": {"_target_": "torch.sigmoid", "_partial_": True, "gain": 1}})
+    require_callable({"activation": {"_target_": "torch.sigmoid", "_partial_": True, "gain": 1}})
 
 
 def test_what_both_stages_share_is_not_given_for_one_of_them():
     cfg = compose_run("task=holdout", "stage=transfer", "+task.transfer.forward_weight=2.0")
-    refused(lambda: requirements.require_environment(cfg), "task.transfer", "task.pretrain.NAME=VALUE")
+    refused(lambda: require_environment(cfg), "task.transfer", "task.pretrain.NAME=VALUE")

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from refusals import refused
 
 from torchrl_mcp import conf
-from torchrl_mcp.runs import build, experiment, requirements
+from torchrl_mcp.runs import build, experiment, imports, requirements
 from torchrl_mcp.runs.configuration import compose_run
 
 HEADING = ["task=heading", "character=humanoid"]
@@ -68,7 +68,7 @@ def test_a_module_of_ones_own_with_the_name_of_another_is_refused_by_its_name(tm
     if written:
         Path(f"{module}.py").write_text("")
     with pytest.raises(ValueError, match=rf"character=x is in the module {module}, but .*rename"):
-        requirements.import_own(module, "character=x is in the module")
+        imports.import_own(module, "character=x is in the module")
 
 
 def test_a_task_of_ones_own_in_a_module_that_python_has_too_is_refused_by_its_name(tmp_path, monkeypatch):
@@ -83,7 +83,7 @@ def test_a_module_of_ones_own_is_taken_from_the_working_directory(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     Path("mine_alone.py").write_text("MINE = True")
-    requirements.import_own("mine_alone", "character=x is in the module")
+    imports.import_own("mine_alone", "character=x is in the module")
     assert sys.modules.pop("mine_alone").MINE
 
 

@@ -9,6 +9,7 @@ import pytest
 from refusals import refused
 
 from torchrl_mcp import conf
+from torchrl_mcp.runs.imports import require_known
 from torchrl_mcp.runs.trust import GET_CLASS, library_names, read_config, require_trusted, trusting
 
 FILE = Path("stranger/config.yaml")
@@ -69,6 +70,7 @@ def test_what_is_not_trusted_is_not_even_imported(tmp_path, monkeypatch):
     (tmp_path / "trap.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(tmp_path)
     refused(lambda: require_trusted(makes("trap.run"), FILE), "trap.run")
+    refused(lambda: require_known(makes("trap.run"), FILE), "trap.run", "--trust")
 
 
 def test_an_interpolation_is_neither_followed_nor_accepted(tmp_path, monkeypatch):

@@ -27,6 +27,12 @@ for module in ("tensordict", "torchrl.envs", "torchrl.objectives", "mujoco", "hy
 ROOT = Path(__file__).resolve().parents[2]
 
 VALUE = "runs/test_validation.py::test_a_value_that_a_setting_cannot_have_is_named"
+ARGUMENT = "envs/tasks/test_arguments.py"
+GROUP = "runs/test_validation.py::test_a_group_in_place_of_a_value_is_named"
+GIVEN = "runs/test_validation.py::test_a_wrong_value_of_an_argument_that_replaces_one_of_the_task_is_named"
+INHERITED = (
+    "runs/test_validation.py::test_the_arguments_of_a_user_s_task_have_the_rules_of_its_signature_and_of_its_bases"
+)
 PLACE = "runs/test_validation.py::test_no_setting_takes_a_run_out_of_the_folder_of_runs"
 KEY = "runs/test_keys.py::test_a_setting_that_is_misspelt_or_in_a_wrong_group_is_named"
 BODY = "runs/test_faults.py::test_a_run_does_not_go_on_with_another_body"
@@ -140,7 +146,7 @@ FAULTS = {
     ],
     "torchrl_mcp/methods/latent_space.py": [
         ("if random else torch.zeros_like(loc)", "if random else torch.ones_like(loc)", "methods/test_latent_space.py"),
-        ("if latent_dim < 1", "if False", "methods/test_latent_space.py"),
+        ("@checked\ndef latent_parts", "def latent_parts", "methods/test_latent_space.py"),
     ],
     "torchrl_mcp/methods/transforms.py": [
         ("steps.masked_fill(begins, 0) + 1", "steps + 1", "methods/test_transforms.py"),
@@ -159,7 +165,7 @@ FAULTS = {
         ("& ~after", "& after", "objectives/test_advantages.py"),
         ("return 1 - gamma", "return 1.0", "objectives/test_advantages.py"),
         (".clamp(-clip, clip)", "", "objectives/test_advantages.py"),
-        ("if not 0 <= gamma < 1", "if not 0 <= gamma <= 1", "objectives/test_advantages.py"),
+        ("@checked\n", "", "objectives/test_advantages.py"),
     ],
     "torchrl_mcp/objectives/latent.py": [("prior).sum(-1)", "prior).mean(-1)", "objectives/test_latent.py")],
     "torchrl_mcp/objectives/option_critic.py": [
@@ -304,7 +310,7 @@ FAULTS = {
         ("ahead > self.library", "ahead < self.library", "envs/tasks/test_imitation.py"),
         (".argmin(0)", ".argmax(0)", "envs/tasks/test_imitation.py"),
         ('if state["motions"] != self.library.digest', "if False", "envs/tasks/test_imitation.py"),
-        ("if switch_candidates < 1", "if False", "envs/tasks/test_arguments.py"),
+        ("switch_candidates: Count", "switch_candidates: int", ARGUMENT),
     ],
     "envs/tasks/ranges.py": [
         ("bounds[:, 0].clamp_(min=clearance)", "bounds[:, 1].clamp_(min=clearance)", "envs/tasks/test_ranges.py"),
@@ -544,15 +550,20 @@ FAULTS = {
     ],
     "torchrl_mcp/runs/places.py": [("member.CRC) for member", "member.file_size) for member", NETWORKS)],
     # Validation of settings
-    "torchrl_mcp/runs/validation.py": [
-        ("_is_whole(value) and value >= 1)", "_is_whole(value) and value >= 0)", VALUE),
-        ("0 <= value < SEEDS)", "0 <= value <= SEEDS)", VALUE),
-        ("_is_number(value) and value > 0)", "_is_number(value) and value >= 0)", VALUE),
-        ("_is_number(value) and 0 <= value < 1)", "_is_number(value) and 0 <= value <= 1)", VALUE),
-        ("isinstance(value, float) and math.isfinite(value)", "isinstance(value, float)", VALUE),
-        (" and not isinstance(value, bool)", "", VALUE),
+    "torchrl_mcp/values.py": [
+        ("is_whole(value) and value >= 1)", "is_whole(value) and value >= 0)", VALUE),
+        ("0 <= n < SEEDS)", "0 <= n <= SEEDS)", VALUE),
+        ('Rule("a finite number above 0", lambda value: is_number(value) and value > 0)', 'Rule("", is_number)', VALUE),
+        ("is_number(value) and 0 <= value < 1)", "is_number(value) and 0 <= value <= 1)", VALUE),
+        (" and math.isfinite(value)", "", VALUE),
+        ("isinstance(value, Integral) and not isinstance(value, bool)", "isinstance(value, Integral)", VALUE),
         ("len(value) == 2 and value[0] <= value[1]", "len(value) == 2", VALUE),
-        ("_is_list(value, COUNT.allows) and bool(value)", "_is_list(value, COUNT.allows)", VALUE),
+        ("is_whole(item) and item >= 1) and len(value) > 0", "is_whole(item) and item >= 1)", VALUE),
+        ("isinstance(value, bool) == isinstance(choice, bool)", "True", "test_values.py"),
+        ("if len(known) < len(rules):", "if False:", "test_values.py"),
+        ("                require(name, value, types_of(function).get(name))", "                pass", ARGUMENT),
+    ],
+    "torchrl_mcp/runs/validation.py": [
         (
             "if not low <= actor <= high",
             "if False",
@@ -560,18 +571,28 @@ FAULTS = {
         ),
         ('if path.startswith("~")', "if False", PLACE),
         ('if value == "???"', "if False", "runs/test_validation.py::test_a_missing_value_is_asked_for"),
-        ("if not wrong and _escapes", "if False and _escapes", PLACE),
-        ("if not isinstance(config.get(name), Mapping)]", "if False]", VALUE),
+        ("if not home and _escapes", "if False and _escapes", PLACE),
+        ("is_group(value) and (rule is None or rule.allows(value))", "is_group(value)", GROUP),
+        ('("pretrain", "transfer", "evaluation"), environment', '("pretrain", "transfer"), environment', INHERITED),
+        ("if wrong := list(wrong_values(given, types)):", "if wrong := []:", GIVEN),
+    ],
+    "torchrl_mcp/runs/names.py": [
         ("if lines := [f", "if False and [f", KEY),
         ('if name not in ("defaults", "hydra", *cfg)]', "if False]", KEY),
     ],
-    "torchrl_mcp/runs/requirements.py": [
-        ("if characters and character not in characters", "if False", "runs/test_remedies.py"),
+    "torchrl_mcp/runs/arguments.py": [
+        ("for called in reversed(_called(name)):", "for called in _called(name)[:1]:", INHERITED),
         (
-            "if unknown and not any(map(_is_open, taken.values()))",
+            "if unknown and not is_open(taken)",
             "if False",
             "runs/test_keys.py::test_an_argument_that_a_class_does_not_take_is_named_with_the_nearest",
         ),
+    ],
+    "torchrl_mcp/runs/imports.py": [
+        ("if characters and character not in characters", "if False", "runs/test_remedies.py"),
+        ("    require_trusted(config, source)\n", "", "runs/test_trust.py"),
+    ],
+    "torchrl_mcp/runs/requirements.py": [
         ('if kind_of_device == "cuda" and not', "if False and not", "runs/test_remedies.py"),
         ('if kind_of_device == "mps"', "if False", "runs/test_remedies.py"),
         ('if kind != "csv" and find_spec(kind) is None', "if False", "runs/test_remedies.py"),
@@ -591,7 +612,6 @@ FAULTS = {
             "    return\n",
             "runs/test_places.py::test_motions_are_found_from_every_folder_and_missed_by_the_name_of_their_setting",
         ),
-        ("    require_trusted(config, source)\n", "", "runs/test_trust.py"),
     ],
     "torchrl_mcp/runs/trust.py": [
         ('if any("${" in f"{name}{value}" for name, value in leaves(config))', "if False", "runs/test_trust.py"),

@@ -18,7 +18,7 @@ def mlp(*sizes):
 def test_the_first_step_of_each_layer_has_its_size():
     """The first step of Adam has the step size, whatever the gradient (Kingma and Ba, 2015, Section 2.1)."""
     network = mlp(16, 128, 32, 1)
-    optimizer = layerwise_adam(network.parameters(), lr=1e-3, inputs=32)
+    optimizer = layerwise_adam(network.parameters(), lr=1e-3, inputs=32, fused=False)
     before = [parameter.detach().clone() for parameter in network.parameters()]
     for parameter in network.parameters():
         parameter.grad = torch.randn_like(parameter)
@@ -30,12 +30,12 @@ def test_the_first_step_of_each_layer_has_its_size():
 
 
 def test_without_a_bound_all_layers_have_equal_steps():
-    (group,) = layerwise_adam(mlp(16, 128, 1).parameters(), lr=1e-3, inputs=float("inf")).param_groups
+    (group,) = layerwise_adam(mlp(16, 128, 1).parameters(), lr=1e-3, inputs=float("inf"), fused=False).param_groups
     assert group["lr"] == 1e-3
 
 
 def test_arguments_reach_adam():
-    optimizer = layerwise_adam(mlp(2, 64, 1).parameters(), lr=1e-3, inputs=32, betas=(0.5, 0.6))
+    optimizer = layerwise_adam(mlp(2, 64, 1).parameters(), lr=1e-3, inputs=32, fused=False, betas=(0.5, 0.6))
     assert type(optimizer) is torch.optim.Adam
     assert {group["betas"] for group in optimizer.param_groups} == {(0.5, 0.6)}
 
@@ -55,5 +55,5 @@ def dead_units(make_optimizer):
 
 
 def test_units_stay_alive_that_die_with_equal_steps():
-    assert dead_units(lambda parameters: layerwise_adam(parameters, lr=1e-3, inputs=32)) < 0.05
+    assert dead_units(lambda parameters: layerwise_adam(parameters, lr=1e-3, inputs=32, fused=False)) < 0.05
     assert dead_units(lambda parameters: torch.optim.Adam(parameters, lr=1e-3)) > 0.1

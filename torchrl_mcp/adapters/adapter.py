@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
 from torchrl_mcp.adapters.reading import Number, Scaling, Vector
+from torchrl_mcp.values import Count, Finite, Names, Positive, Range, Rule, is_list
 
 GOALS = ("desired_goal", "goal")
 """Keys of the goal, of which the first that is observed is taken by default; Gymnasium's is ``desired_goal``."""
@@ -27,6 +28,17 @@ LIMITS = ("max_episode_steps", "max_episode_length")
 
 CONTROL_TIMESTEP = 0.05
 """Seconds of a step of environments that do not say how long it is; only films show it."""
+
+
+# Keys of observations, of which nested keys are lists of names
+Keys = Annotated[
+    Sequence[NestedKey],
+    Rule("a list of names", lambda value: is_list(value, lambda item: is_list(item, _is_name) or _is_name(item))),
+]
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
 
 
 class Adapter(EnvBase):
@@ -78,15 +90,15 @@ class Adapter(EnvBase):
         self,
         env: EnvBase,
         *,
-        observation: Sequence[NestedKey] = ("observation",),
-        goal: Sequence[NestedKey] | None = None,
+        observation: Keys = ("observation",),
+        goal: Keys | None = None,
         goal_number: NestedKey | None = None,
-        metrics: Sequence[str] = (),
-        max_episode_steps: int | None = None,
-        worst: float = 0.0,
-        solved: float = 1.0,
-        action_bounds: Sequence[float] | None = None,
-        control_timestep: float = CONTROL_TIMESTEP,
+        metrics: Names = (),
+        max_episode_steps: Count | None = None,
+        worst: Finite = 0.0,
+        solved: Finite = 1.0,
+        action_bounds: Range | None = None,
+        control_timestep: Positive = CONTROL_TIMESTEP,
         render: Callable[[int], Any] | None = None,
         snapshots: bool = False,
         name: str = "",
@@ -313,14 +325,16 @@ class OwnEnvs(Adapter):
             the method ``render(index)`` of the environments, if there is one; it returns what :meth:`Adapter.render`
             returns.
         num_envs: Number of environments.
-        seed: Seed of the environments.
+        seed: int of the environments.
         **settings: Passed on to :class:`Adapter`.
 
     Raises:
         ValueError: For the reasons of :class:`Adapter`.
     """
 
-    def __init__(self, env: Callable[..., EnvBase], num_envs: int, *, seed: int | None = None, **settings: Any) -> None:
+    def __init__(
+        self, env: Callable[..., EnvBase], num_envs: Count, *, seed: int | None = None, **settings: Any
+    ) -> None:
         maker = env.func if isinstance(env, partial) else env
         # The signature of a class of environments is that of TorchRL's metaclass.
         taken = inspect.signature(maker.__init__ if inspect.isclass(maker) else maker).parameters

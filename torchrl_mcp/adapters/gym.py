@@ -12,6 +12,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import GymWrapper, default_info_dict_reader
 
 from torchrl_mcp.adapters.adapter import Adapter, described
+from torchrl_mcp.values import Count, Names
 
 RGB_ARRAY = "rgb_array"
 
@@ -31,7 +32,7 @@ class GymnasiumEnvs(Adapter):
     Args:
         id: Name for ``gymnasium.make``, such as ``HalfCheetah-v5`` or ``module:name``.
         num_envs: Number N of environments.
-        seed: Seed of the first environment; the others have the seeds that follow.
+        seed: int of the first environment; the others have the seeds that follow.
         kwargs: Further arguments of ``gymnasium.make``.
         info: Names of entries of ``info`` that are metrics, such as ``is_success``.
         max_episode_steps: Steps after which an episode is ``truncated``; None for the limit of Gymnasium.
@@ -51,12 +52,12 @@ class GymnasiumEnvs(Adapter):
     def __init__(
         self,
         id: str | None,
-        num_envs: int,
+        num_envs: Count,
         *,
         seed: int | None = None,
         kwargs: Mapping[str, Any] = MappingProxyType({}),
-        info: Sequence[str] = (),
-        max_episode_steps: int | None = None,
+        info: Names = (),
+        max_episode_steps: Count | None = None,
         **settings: Any,
     ) -> None:
         if id is None:

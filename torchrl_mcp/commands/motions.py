@@ -39,7 +39,7 @@ def main(words: list[str]) -> None:
     """Run the subcommand."""
     arguments = parser().parse_args(words)
     require_files(arguments)
-    from torchrl_mcp.runs.requirements import import_own
+    from torchrl_mcp.runs.imports import import_own
 
     if arguments.module:
         import_own(arguments.module, "--module names")

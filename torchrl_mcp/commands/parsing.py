@@ -206,12 +206,10 @@ def task_settings(words: list[str]) -> dict[str, Any]:
     """Return the values of ``--task KEY=VALUE`` by key; a dot in a key leads to an entry of an argument.
 
     Raises:
-        ValueError: If a word cannot be read, has no value or a wrong one, or names an argument that the command passes.
+        ValueError: If a word cannot be read, has no value, or names an argument that the command passes.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-
-    from torchrl_mcp.runs.validation import wrong_values
 
     if valueless := [word for word in words if "=" not in word]:
         raise ValueError(f"--task {valueless[0]} has no value: write --task {valueless[0]}=VALUE")
@@ -224,8 +222,6 @@ def task_settings(words: list[str]) -> dict[str, Any]:
         raise ValueError(
             f"--task {unread[0]} would have no effect: use the options of this command, which --help lists"
         )
-    if wrong := list(wrong_values(settings)):
-        raise ValueError("\n".join(f"--task {line}" for line in wrong))
     return settings
 
 

@@ -120,9 +120,9 @@ def _is_argument(key: str, cfg: DictConfig) -> bool:
     target = group and OmegaConf.select(cfg, f"{group}._target_")
     if not target:
         return False
-    from torchrl_mcp.runs import requirements  # takes seconds
+    from torchrl_mcp.runs.arguments import arguments  # takes seconds
 
-    return name in requirements.arguments(target)
+    return name in arguments(target)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

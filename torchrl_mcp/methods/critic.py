@@ -1,17 +1,16 @@
 """Value functions as TensorDictModules."""
 
-from collections.abc import Sequence
-
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_mcp.methods.actor import GOAL, STATE, Sizes, normalise_inputs
 from torchrl_mcp.modules.gating import scaled_cells
+from torchrl_mcp.values import Positive, Widths
 
 
 def value_critic(
-    parts: nn.ModuleDict, sizes: Sizes, *, num_cells: Sequence[int] = (1024, 512), width: float = 1.0
+    parts: nn.ModuleDict, sizes: Sizes, *, num_cells: Widths = (1024, 512), width: Positive = 1.0
 ) -> TensorDictSequential:
     """Add the part ``critic``, V(s, g), and return it as a module from ``observation`` and ``goal`` to ``state_value``.
 

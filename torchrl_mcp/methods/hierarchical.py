@@ -9,9 +9,10 @@ from torchrl.modules import IndependentNormal
 
 from torchrl_mcp.methods.actor import GOAL, STATE, Actor, Explorer, Sizes, input_normalisers, normalise_inputs, sampler
 from torchrl_mcp.methods.options import Choice, RandomSequence, WhereBeginning, keep_option
+from torchrl_mcp.values import Count, checked
 
 
-def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: int) -> nn.ModuleDict:
+def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_options: Count) -> nn.ModuleDict:
     """Make the parts of pre-training: ``observation_normaliser``, ``goal_normaliser`` and ``primitives``.
 
     Args:
@@ -31,7 +32,7 @@ def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_o
 
 
 def gated_parts(
-    sizes: Sizes, *, gating: Callable[..., nn.Module], primitives: Callable[..., nn.Module], num_options: int
+    sizes: Sizes, *, gating: Callable[..., nn.Module], primitives: Callable[..., nn.Module], num_options: Count
 ) -> nn.ModuleDict:
     """Make the parts of transfer: the parts of :func:`primitive_parts` and ``gating``.
 
@@ -49,7 +50,7 @@ def gated_parts(
     return parts
 
 
-def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collection[str] = ()) -> Actor:
+def primitive_actor(parts: nn.ModuleDict, *, num_options: Count, frozen: Collection[str] = ()) -> Actor:
     """Let the primitive act whose index the environment sends as ``option``, so that all primitives train side by side.
 
     Args:
@@ -61,11 +62,12 @@ def primitive_actor(parts: nn.ModuleDict, *, num_options: int, frozen: Collectio
     return Actor(policy, policy, stored=("option",), num_options=num_options)
 
 
+@checked
 def gated_actor(
     parts: nn.ModuleDict,
     *,
-    num_options: int,
-    steps_per_choice: int,
+    num_options: Count,
+    steps_per_choice: Count,
     action_noise: bool = True,
     frozen: Collection[str] = (),
 ) -> Actor:
@@ -102,8 +104,6 @@ def gated_actor(
     """
     if "primitives" not in frozen:
         raise ValueError("choosing a primitive trains only the gate: keep 'primitives' in transfer.freeze")
-    if steps_per_choice < 1:
-        raise ValueError(f"steps_per_choice must be at least 1, got {steps_per_choice}")
     gate = WhereBeginning(parts["gating"], num_options)
     choice = sampler("option", Choice, logits="gate_logits")
     trained = ProbabilisticTensorDictSequential(
@@ -123,7 +123,7 @@ def gated_actor(
 
 
 def random_sequence(
-    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
+    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: Count, steps: Count
 ) -> Explorer:
     """Return a :class:`.RandomSequence` of the primitives in the parts of :func:`primitive_parts`."""
     return RandomSequence(parts["primitives"], num, generator, num_options=num_options, steps=steps)
@@ -132,7 +132,7 @@ def random_sequence(
 class Clock(nn.Module):
     """Decides when the gate chooses again."""
 
-    def __init__(self, steps_per_choice: int) -> None:
+    def __init__(self, steps_per_choice: Count) -> None:
         """Set the number of control steps between choices."""
         super().__init__()
         self.steps_per_choice = steps_per_choice

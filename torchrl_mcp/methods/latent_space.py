@@ -43,14 +43,16 @@ from torchrl_mcp.methods.actor import (
     sampler,
 )
 from torchrl_mcp.methods.mcp import ConstantScale
+from torchrl_mcp.values import Count, Positive, checked
 
 NOISE = ("latent", "noise")
 ENCODING = (("latent", "loc"), ("latent", "scale"))
 LATENT = ("latent", "sample")
 
 
+@checked
 def latent_parts(
-    sizes: Sizes, *, encoder: Callable[..., nn.Module], decoder: Callable[..., nn.Module], latent_dim: int
+    sizes: Sizes, *, encoder: Callable[..., nn.Module], decoder: Callable[..., nn.Module], latent_dim: Count
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``encoder`` and ``decoder``.
 
@@ -66,8 +68,6 @@ def latent_parts(
     Raises:
         ValueError: If ``latent_dim`` is not positive.
     """
-    if latent_dim < 1:
-        raise ValueError(f"latent_dim must be at least 1, got {latent_dim}")
     return nn.ModuleDict(
         {
             **input_normalisers(sizes),
@@ -111,7 +111,8 @@ def latent_actor(parts: nn.ModuleDict, *, frozen: Collection[str] = ()) -> Actor
     return Actor(policy, ProbabilisticTensorDictSequential(*encoder, *decoder), stored=(NOISE,), drawn=(NOISE,))
 
 
-def latents_actor(parts: nn.ModuleDict, *, latent_std: float | None = None, frozen: Collection[str] = ()) -> Actor:
+@checked
+def latents_actor(parts: nn.ModuleDict, *, latent_std: Positive | None = None, frozen: Collection[str] = ()) -> Actor:
     r"""Explore over the latent variable: sample :math:`q(w|s, g)` and play the decoder's mean action.
 
     The policy gradient uses the density of the latent variable, as :func:`~torchrl_mcp.methods.mcp.weights_actor` uses
@@ -158,7 +159,7 @@ def latent_noise(loc: Tensor) -> Tensor:
     return torch.randn_like(loc) if random else torch.zeros_like(loc)
 
 
-def random_latents(parts: nn.ModuleDict, num: int, generator: torch.Generator, *, latent_dim: int) -> Explorer:
+def random_latents(parts: nn.ModuleDict, num: int, generator: torch.Generator, *, latent_dim: Count) -> Explorer:
     """Return an explorer that decodes a random latent variable, one for each simulation, and plays the mean action.
 
     Args:

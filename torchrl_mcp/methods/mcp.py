@@ -24,18 +24,20 @@ from torchrl_mcp.methods.actor import (
     sampler,
 )
 from torchrl_mcp.modules.gaussian import state_independent_scale
+from torchrl_mcp.values import Count, Positive, checked
 
 
+@checked
 def composite_parts(
     sizes: Sizes,
     *,
     gating: Callable[..., nn.Module],
     gate_activation: Callable[[Tensor], Tensor],
     primitives: Callable[..., nn.Module],
-    num_primitives: int,
+    num_primitives: Count,
     distribution_class: Composition,
-    initial_std: float,
-    learned_logits_std: float | None = None,
+    initial_std: Positive,
+    learned_logits_std: Positive | None = None,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``gating``, ``primitives`` and ``gate_noise``.
 
@@ -65,8 +67,6 @@ def composite_parts(
     Example:
         See :func:`composite_actor`.
     """
-    if num_primitives < 1:
-        raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
     # A composite's standard deviation is proportional to its primitives'. First compose K unit Gaussians at the gate's
     # initial weights and divide. Then do the same with the networks, whose primitives have different means.
     gates = _valid(gate_activation(torch.zeros(num_primitives)))
@@ -170,12 +170,13 @@ def composite_actor(
     return Actor(policy, trained, stored=("gates", *PRIMITIVES))
 
 
+@checked
 def weights_actor(
     parts: nn.ModuleDict,
     *,
     gate_activation: nn.Module,
     distribution_class: Composition,
-    logits_std: float,
+    logits_std: Positive,
     frozen: Collection[str] = (),
 ) -> Actor:
     r"""Explore over the weights: sample :math:`\omega(w|s, g)` and play the composite's deterministic action.
@@ -232,7 +233,7 @@ def random_weights(
     num: int,
     generator: torch.Generator,
     *,
-    num_primitives: int,
+    num_primitives: Count,
     gate_activation: Callable[[Tensor], Tensor],
     distribution_class: Composition,
 ) -> Explorer:
@@ -265,11 +266,9 @@ def random_weights(
 class ConstantScale(nn.Module):
     """A standard deviation that does not depend on the input."""
 
-    def __init__(self, std: float) -> None:
-        """Set the standard deviation, which must be positive."""
+    def __init__(self, std: Positive) -> None:
+        """Set the standard deviation."""
         super().__init__()
-        if not std > 0:
-            raise ValueError(f"logits_std must be positive, got {std}")
         self.std = std
 
     def forward(self, loc: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,7 @@ options and their termination probabilities.
 | ``termination`` | beta of the option that acted, in the next state | ``(*B)`` |
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
 
 import torch
@@ -46,6 +46,7 @@ from torchrl_mcp.methods.options import (
     of_option,
 )
 from torchrl_mcp.modules.gating import scaled_cells
+from torchrl_mcp.values import Count, Positive, Share, Widths
 
 ARRIVAL = ("next", "observation")
 
@@ -55,9 +56,9 @@ def option_critic_parts(
     *,
     options: Callable[..., nn.Module],
     terminations: Callable[..., nn.Module],
-    values_cells: Sequence[int],
-    num_options: int,
-    width: float = 1.0,
+    values_cells: Widths,
+    num_options: Count,
+    width: Positive = 1.0,
 ) -> nn.ModuleDict:
     """Make the parts ``observation_normaliser``, ``goal_normaliser``, ``options``, ``terminations`` and ``critic``.
 
@@ -89,7 +90,7 @@ def option_critic_parts(
 
 
 def option_critic_actor(
-    parts: nn.ModuleDict, *, num_options: int, epsilon: float, frozen: Collection[str] = ()
+    parts: nn.ModuleDict, *, num_options: Count, epsilon: Share, frozen: Collection[str] = ()
 ) -> Actor:
     r"""Choose the option of highest value at the beginning of an episode and when an option ends, and let it act.
 
@@ -163,7 +164,7 @@ def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:
 
 
 def random_sequence(
-    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: int, steps: int
+    parts: nn.ModuleDict, num: int, generator: torch.Generator, *, num_options: Count, steps: Count
 ) -> Explorer:
     """Return a :class:`.RandomSequence` of the options in the parts of :func:`option_critic_parts`."""
 

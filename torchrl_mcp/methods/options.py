@@ -1,7 +1,7 @@
 """Options: policies that do not see the goal. One of them acts at a time, chosen by a policy that sees the goal."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NoReturn, Self
 
 import torch
@@ -9,6 +9,7 @@ from torch import Size, Tensor, nn
 from torch.distributions import Categorical, Distribution
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
+from torchrl_mcp.values import Count, Positive, Probability, Widths, checked
 
 
 class SeparateOptions(nn.Module):
@@ -30,11 +31,11 @@ class SeparateOptions(nn.Module):
         (torch.Size([16, 17]), torch.Size([16, 17]))
     """
 
+    @checked
     def __init__(
-        self, observation_dim: int, action_dim: int, num_options: int, *, policy: Callable[..., nn.Module]
+        self, observation_dim: int, action_dim: int, num_options: Count, *, policy: Callable[..., nn.Module]
     ) -> None:
         super().__init__()
-        _require_options(num_options)
         self.policies = nn.ModuleList(policy(observation_dim, 0, action_dim) for _ in range(num_options))
 
     def forward(self, observation: Tensor, option: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,19 +71,17 @@ class Terminations(nn.Module):
         torch.Size([16, 8])
     """
 
+    @checked
     def __init__(
         self,
         observation_dim: int,
-        num_options: int,
+        num_options: Count,
         *,
-        num_cells: Sequence[int],
-        initial: float,
-        width: float = 1.0,
+        num_cells: Widths,
+        initial: Probability,
+        width: Positive = 1.0,
     ) -> None:
         super().__init__()
-        _require_options(num_options)
-        if not 0 < initial < 1:
-            raise ValueError(f"initial={initial} must be a probability: pass a number between 0 and 1")
         num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim, num_cells)
         self.output = scaled_linear(num_cells[-1], num_options, gain=0.01)
@@ -101,7 +100,7 @@ class WhereBeginning(nn.Module):
         num_options: Number of options, ``K``.
     """
 
-    def __init__(self, scores: nn.Module, num_options: int) -> None:
+    def __init__(self, scores: nn.Module, num_options: Count) -> None:
         super().__init__()
         self.scores = scores
         self.num_options = num_options
@@ -130,8 +129,8 @@ class RandomSequence:
         num: int,
         generator: torch.Generator,
         *,
-        num_options: int,
-        steps: int,
+        num_options: Count,
+        steps: Count,
     ) -> None:
         self._options = options
         self._num = num
@@ -216,7 +215,7 @@ def of_option(values: Tensor, option: Tensor) -> Tensor:
     return values.gather(-1, option.unsqueeze(-1).expand(*values.shape[:-1], 1))
 
 
-def option_diagnostics(option: Tensor, begins: Tensor, num_options: int) -> dict[str, Tensor]:
+def option_diagnostics(option: Tensor, begins: Tensor, num_options: Count) -> dict[str, Tensor]:
     """Summarise which options act and for how long: whether one option does everything, or options switch all the time.
 
     - ``usage_k`` is the share of steps in which option k acts.
@@ -248,8 +247,3 @@ def option_diagnostics(option: Tensor, begins: Tensor, num_options: int) -> dict
         "duration": rate.reciprocal(),
         **{f"usage_{k}": share for k, share in enumerate(usage)},
     }
-
-
-def _require_options(num_options: int) -> None:
-    if num_options < 1:
-        raise ValueError(f"num_options must be at least 1, got {num_options}")

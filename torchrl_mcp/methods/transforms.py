@@ -11,6 +11,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
+from torchrl_mcp.values import Count
+
 
 class TransformedCharacterEnv(TransformedEnv):
     """Environments with transforms, where the state of both can be set, saved and restored.
@@ -117,7 +119,7 @@ class ClipAsOption(Transform):
         Peng et al., *MCP*, NeurIPS 2019, Section E.4. https://arxiv.org/abs/1905.09808
     """
 
-    def __init__(self, num_options: int) -> None:
+    def __init__(self, num_options: Count) -> None:
         super().__init__()
         self.num_options = num_options
 

@@ -1,11 +1,12 @@
 """Gating networks, and diagnostics of their weights."""
 
 import warnings
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
+
+from torchrl_mcp.values import Count, NotNegative, Positive, Widths, checked
 
 
 class Gating(nn.Module):
@@ -42,13 +43,13 @@ class Gating(nn.Module):
         self,
         observation_dim: int,
         goal_dim: int,
-        num_primitives: int,
+        num_primitives: Count,
         *,
-        state_cells: Sequence[int] = (512, 256),
-        goal_cells: Sequence[int] = (512, 256),
-        joint_cells: Sequence[int] = (256,),
-        width: float = 1.0,
-        output_gain: float = 1.0,
+        state_cells: Widths = (512, 256),
+        goal_cells: Widths = (512, 256),
+        joint_cells: Widths = (256,),
+        width: Positive = 1.0,
+        output_gain: NotNegative = 1.0,
     ) -> None:
         super().__init__()
         state_cells, goal_cells, joint_cells = (
@@ -92,11 +93,11 @@ class JointGating(nn.Module):
         self,
         observation_dim: int,
         goal_dim: int,
-        num_primitives: int,
+        num_primitives: Count,
         *,
-        num_cells: Sequence[int] = (1024, 512),
-        width: float = 1.0,
-        output_gain: float = 1.0,
+        num_cells: Widths = (1024, 512),
+        width: Positive = 1.0,
+        output_gain: NotNegative = 1.0,
     ) -> None:
         super().__init__()
         num_cells = scaled_cells(num_cells, width)
@@ -108,21 +109,20 @@ class JointGating(nn.Module):
         return at_least_single(self.output(self.body(observation, goal)))
 
 
-def scaled_cells(num_cells: Sequence[int], width: float) -> list[int]:
+@checked
+def scaled_cells(num_cells: Widths, width: Positive) -> list[int]:
     """Return numbers of hidden units times ``width``, rounded.
 
     Raises:
         ValueError: If ``num_cells`` is not a list of layers, or a layer would have no units.
     """
-    if isinstance(num_cells, int) or not num_cells:
-        raise ValueError(f"num_cells={num_cells} must be a list with the units of one layer or more, such as [64]")
     scaled = [round(cells * width) for cells in num_cells]
     if min(scaled) < 1:
         raise ValueError(f"width={width} leaves no units in a layer of {min(num_cells)}: pass a larger one")
     return scaled
 
 
-def relu_mlp(in_features: int, num_cells: Sequence[int]) -> MLP:
+def relu_mlp(in_features: int, num_cells: Widths) -> MLP:
     """Return fully connected layers, each followed by a ReLU (Figure 3).
 
     Without inputs, as for the goal of a task that has none, the features are constants.

@@ -1,13 +1,13 @@
 """The policy network of the scratch model."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
+from torchrl_mcp.values import NotNegative, Positive, Positives, Widths
 
 LEAST_STD = 1e-4
 """Standard deviation at which TorchRL's :class:`AddStateIndependentNormalScale` clamps."""
@@ -50,11 +50,11 @@ class GaussianPolicy(nn.Module):
         goal_dim: int,
         action_dim: int,
         *,
-        num_cells: Sequence[int] = (1024, 512),
-        width: float = 1.0,
-        std: float | Sequence[float] = 0.1,
+        num_cells: Widths = (1024, 512),
+        width: Positive = 1.0,
+        std: Positive | Positives = 0.1,
         learned_std: bool = False,
-        output_gain: float = 0.01,
+        output_gain: NotNegative = 0.01,
     ) -> None:
         super().__init__()
         num_cells = scaled_cells(num_cells, width)
@@ -68,7 +68,7 @@ class GaussianPolicy(nn.Module):
 
 
 @torch.no_grad()
-def restart_noise(network: nn.Module, std: float) -> None:
+def restart_noise(network: nn.Module, std: Positive) -> None:
     """Set the standard deviations of all policies in a network whose noise is the same in all states.
 
     Args:
@@ -86,7 +86,7 @@ def restart_noise(network: nn.Module, std: float) -> None:
 
 
 def state_independent_scale(
-    std: float | Sequence[float], action_dim: int, learned: bool
+    std: Positive | Positives, action_dim: int, learned: bool
 ) -> AddStateIndependentNormalScale:
     """Return the module that adds standard deviations, one for all actions or one each, to means ``(*B, A)``.
 

@@ -1,11 +1,10 @@
 """A policy network that gets new inputs without a change of its output."""
 
-from collections.abc import Sequence
-
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 from torchrl_mcp.modules.gaussian import state_independent_scale
+from torchrl_mcp.values import NotNegative, Positive, Positives, Widths
 
 
 class InputInjection(nn.Linear):
@@ -77,11 +76,11 @@ class InjectedPolicy(nn.Module):
         observation_dim: int,
         action_dim: int,
         *,
-        num_cells: Sequence[int] = (1024, 512),
-        width: float = 1.0,
-        std: float | Sequence[float] = 0.1,
+        num_cells: Widths = (1024, 512),
+        width: Positive = 1.0,
+        std: Positive | Positives = 0.1,
         learned_std: bool = False,
-        output_gain: float = 0.01,
+        output_gain: NotNegative = 0.01,
     ) -> None:
         super().__init__()
         num_cells = scaled_cells(num_cells, width)

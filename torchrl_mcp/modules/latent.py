@@ -1,10 +1,9 @@
 """Encoders of the latent space model: from goals to distributions of a latent variable."""
 
-from collections.abc import Sequence
-
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
+from torchrl_mcp.values import Count, Positive, Widths
 
 
 class StateGoalEncoder(nn.Module):
@@ -33,10 +32,10 @@ class StateGoalEncoder(nn.Module):
         self,
         observation_dim: int,
         goal_dim: int,
-        latent_dim: int,
+        latent_dim: Count,
         *,
-        num_cells: Sequence[int] = (1024, 512),
-        width: float = 1.0,
+        num_cells: Widths = (1024, 512),
+        width: Positive = 1.0,
     ) -> None:
         super().__init__()
         num_cells = scaled_cells(num_cells, width)
@@ -80,10 +79,10 @@ class GoalEncoder(StateGoalEncoder):
         self,
         observation_dim: int,
         goal_dim: int,
-        latent_dim: int,
+        latent_dim: Count,
         *,
-        num_cells: Sequence[int] = (256, 128),
-        width: float = 1.0,
+        num_cells: Widths = (256, 128),
+        width: Positive = 1.0,
     ) -> None:
         super().__init__(0, goal_dim, latent_dim, num_cells=num_cells, width=width)
 

@@ -8,6 +8,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
+from torchrl_mcp.values import Count, NotNegative, Positive, Whole, Widths, checked
 
 
 class Primitives(nn.Module):
@@ -45,25 +46,21 @@ class Primitives(nn.Module):
         (torch.Size([16, 8, 17]), torch.Size([16, 8, 17]))
     """
 
+    @checked
     def __init__(
         self,
         observation_dim: int,
         action_dim: int,
-        num_primitives: int,
+        num_primitives: Count,
         *,
-        trunk_cells: Sequence[int] = (512, 256),
-        branch_cells: int = 256,
-        width: float = 1.0,
-        initial_std: float = 1.0,
-        output_gain: float = 1.0,
-        std_gain: float = 1.0,
+        trunk_cells: Widths = (512, 256),
+        branch_cells: Whole = 256,
+        width: Positive = 1.0,
+        initial_std: Positive = 1.0,
+        output_gain: NotNegative = 1.0,
+        std_gain: Positive = 1.0,
     ) -> None:
         super().__init__()
-        if num_primitives < 1:
-            raise ValueError(f"num_primitives must be at least 1, got {num_primitives}")
-        for name, value in (("initial_std", initial_std), ("std_gain", std_gain)):
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
         trunk_cells = scaled_cells(trunk_cells, width)
         branch_cells = scaled_cells([branch_cells], width)[0] if branch_cells else 0
         self.trunk = relu_mlp(observation_dim, trunk_cells)

@@ -8,6 +8,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
+from torchrl_mcp.values import Discount, Positive, Share, checked
+
 
 class Advantages:
     r"""GAE(:math:`\lambda`) with TD(:math:`\lambda`) value targets, bootstrapped at time limits.
@@ -45,7 +47,7 @@ class Advantages:
 
     out_keys = ("advantage", "value_target")
 
-    def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
+    def __init__(self, critic: TensorDictModuleBase, *, gamma: Discount, lmbda: Share, clip: Positive) -> None:
         self.critic = critic
         self.clip = clip
         self.gae = ScaledGAE(gamma, lmbda)
@@ -73,7 +75,7 @@ class ScaledGAE:
         ValueError: If ``gamma`` is not at least 0 and below 1.
     """
 
-    def __init__(self, gamma: float, lmbda: float) -> None:
+    def __init__(self, gamma: Discount, lmbda: Share) -> None:
         self.reward_scale = reward_scale(gamma)
         self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
 
@@ -107,18 +109,17 @@ def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[Tens
     return arrived
 
 
-def normalised(advantage: Tensor, clip: float) -> Tensor:
+def normalised(advantage: Tensor, clip: Positive) -> Tensor:
     """Scale advantages of a batch to zero mean and unit variance, and clip them; a single advantage becomes 0."""
     deviation = advantage.std(correction=min(1, advantage.numel() - 1))
     return ((advantage - advantage.mean()) / deviation.clamp_min(1e-8)).clamp(-clip, clip)
 
 
-def reward_scale(gamma: float) -> float:
+@checked
+def reward_scale(gamma: Discount) -> float:
     r"""Return the factor on rewards that gives returns the size of a reward, :math:`1 - \gamma`.
 
     Raises:
         ValueError: If ``gamma`` is not at least 0 and below 1: at 1 all rewards would be 0.
     """
-    if not 0 <= gamma < 1:
-        raise ValueError(f"gamma={gamma} must be at least 0 and below 1: rewards are scaled by 1 - gamma")
     return 1 - gamma

@@ -10,6 +10,7 @@ from torch.distributions import Distribution, Normal, kl_divergence
 
 from torchrl_mcp.methods.latent_space import ENCODING
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
+from torchrl_mcp.values import NotNegative
 
 
 class LatentPPOLoss(BoundedClipPPOLoss):
@@ -55,7 +56,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         critic_network: TensorDictModuleBase | None = None,
         *,
-        kl_coeff: float,
+        kl_coeff: NotNegative,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, critic_network, **kwargs)

@@ -18,6 +18,7 @@ from torchrl_mcp.methods.options import EpsilonGreedy, of_option
 from torchrl_mcp.objectives.advantages import ScaledGAE, normalised, upon_arrival
 from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
 from torchrl_mcp.objectives.values import ValueLoss
+from torchrl_mcp.values import Discount, NotNegative, Positive, Share
 
 
 class OptionAdvantages:
@@ -84,11 +85,11 @@ class OptionAdvantages:
         self,
         critic: TensorDictModuleBase,
         *,
-        gamma: float,
-        lmbda: float,
-        clip: float,
-        epsilon: float,
-        termination_cost: float,
+        gamma: Discount,
+        lmbda: Share,
+        clip: Positive,
+        epsilon: Share,
+        termination_cost: NotNegative,
     ) -> None:
         self.critic = critic
         self.clip = clip
@@ -153,7 +154,7 @@ class OptionValueLoss(ValueLoss):
         ['explained_variance', 'loss_critic']
     """
 
-    def __init__(self, critic_network: TensorDictSequential, *, coeff: float) -> None:
+    def __init__(self, critic_network: TensorDictSequential, *, coeff: NotNegative) -> None:
         super().__init__(critic_network.select_subsequence(out_keys=["option_values"]), coeff=coeff)
 
     def _values(self, samples: TensorDictBase) -> Tensor:

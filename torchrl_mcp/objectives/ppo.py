@@ -9,6 +9,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
 
+from torchrl_mcp.values import NotNegative, Positive
+
 
 class BoundedClipPPOLoss(ClipPPOLoss):
     r"""TorchRL's clipped PPO loss plus a penalty that keeps the mean action inside its bounds.
@@ -56,8 +58,8 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         actor_network: ProbabilisticTensorDictSequential,
         critic_network: TensorDictModuleBase | None = None,
         *,
-        bound_coeff: float,
-        bound: float = 1.0,
+        bound_coeff: NotNegative,
+        bound: Positive = 1.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, critic_network, **kwargs)

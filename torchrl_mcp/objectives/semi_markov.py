@@ -6,6 +6,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_mcp.objectives.advantages import normalised, reward_scale, upon_arrival
+from torchrl_mcp.values import Discount, Positive, Share
 
 
 class SemiMarkovAdvantages:
@@ -53,7 +54,7 @@ class SemiMarkovAdvantages:
 
     out_keys = ("advantage", "value_target")
 
-    def __init__(self, critic: TensorDictModuleBase, *, gamma: float, lmbda: float, clip: float) -> None:
+    def __init__(self, critic: TensorDictModuleBase, *, gamma: Discount, lmbda: Share, clip: Positive) -> None:
         self.critic = critic
         self.gamma = gamma
         self.lmbda = lmbda

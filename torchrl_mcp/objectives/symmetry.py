@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_mcp.methods.actor import Actor
 from torchrl_mcp.objectives.actor_loss import ActorLoss
+from torchrl_mcp.values import NotNegative, Positive
 
 
 class MirroredSamples:
@@ -54,7 +55,7 @@ class MirroredSamples:
     """
 
     def __init__(
-        self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module], *, tolerance: float = 20.0
+        self, advantages: Any, actor: Actor, mirrors: Mapping[str, nn.Module], *, tolerance: Positive = 20.0
     ) -> None:
         _require_actions(actor)
         self.advantages = advantages
@@ -123,7 +124,7 @@ class SymmetryLoss(ActorLoss):
         ['loss_bound', 'loss_objective', 'loss_symmetry']
     """
 
-    def __init__(self, loss: ActorLoss, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: float) -> None:
+    def __init__(self, loss: ActorLoss, actor: Actor, mirrors: Mapping[str, nn.Module], *, coeff: NotNegative) -> None:
         super().__init__()
         _require_actions(actor)
         self.loss = loss

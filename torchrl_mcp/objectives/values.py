@@ -5,6 +5,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from torchrl_mcp.values import NotNegative
+
 
 class ValueLoss(nn.Module):
     r"""Mean squared error of a value function against its targets.
@@ -29,7 +31,7 @@ class ValueLoss(nn.Module):
         ['explained_variance', 'loss_critic']
     """
 
-    def __init__(self, critic_network: TensorDictModuleBase, *, coeff: float) -> None:
+    def __init__(self, critic_network: TensorDictModuleBase, *, coeff: NotNegative) -> None:
         super().__init__()
         self.critic_network = critic_network
         self.coeff = coeff

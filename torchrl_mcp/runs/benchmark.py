@@ -30,7 +30,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from torchrl_mcp.runs import experiment, quoting, records
 from torchrl_mcp.runs.configuration import planned
 from torchrl_mcp.runs.identity import TRANSFER_ONLY, differences, is_among
-from torchrl_mcp.runs.requirements import require_environment
+from torchrl_mcp.runs.imports import require_environment
+from torchrl_mcp.runs.requirements import require_settings
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.runs.trust import targets, trusting
 from torchrl_mcp.training.run_folder import CONFIG, LOG
@@ -217,8 +218,9 @@ def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Jo
     with _current(cfg):
         with read_write(cfg), open_dict(cfg):
             del cfg["hydra"]
+        require_settings(cfg)
+        require_environment(cfg)
         plan = planned(cfg)
-        require_environment(plan.cfg)
     return Job(plan.folder, overrides, plan.config)
 
 

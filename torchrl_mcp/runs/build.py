@@ -20,15 +20,12 @@ from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.transforms import TransformedCharacterEnv
 from torchrl_mcp.modules.gaussian import restart_noise
 from torchrl_mcp.runs import places
+from torchrl_mcp.runs.arguments import applicable, require_arguments
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.imports import require_environment
 from torchrl_mcp.runs.publish import load_kept
-from torchrl_mcp.runs.requirements import (
-    applicable,
-    require_arguments,
-    require_entry,
-    require_environment,
-    require_files,
-)
+from torchrl_mcp.runs.requirements import require_files
+from torchrl_mcp.runs.validation import require_values
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.collectors import TrajectorySource
 from torchrl_mcp.training.metrics import begin_after
@@ -74,12 +71,13 @@ def make_env(cfg: DictConfig, *, num_envs: int, seed: int, **kwargs: Any) -> Env
             that the task builds, such as its reference motions.
 
     Raises:
-        ValueError: As :func:`require_environment`, or if the environments do not take an argument.
+        ValueError: As :func:`require_environment`, or if the environments do not take an argument or its value.
     """
     require_environment(cfg)
     task, further = _with_parts(cfg.task[cfg.stage.name], kwargs)
     arguments = applicable(task["_target_"], {"num_threads": cfg.num_threads, **further})
     require_arguments(task["_target_"], arguments)
+    require_values(cfg.task[cfg.stage.name], kwargs)
     require_files(cfg, task)
     env = instantiate(task)(num_envs=num_envs, seed=seed, **arguments)
     require_contract(env)
@@ -151,7 +149,7 @@ def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environ
     if (name := cfg.transfer.goal_entry) is None:
         load_kept(parts, cfg.transfer.keep, pretrained, origin)
         return
-    entry = require_entry(env, name)
+    entry = _goal_entry(env, name)
     narrow = instantiate(cfg.parts)(sizes._replace(goal=entry.stop - entry.start))
     load_kept(narrow, cfg.transfer.keep, pretrained, origin)
     reading_goal = [part for part in narrow if _shapes(parts[part]) != _shapes(narrow[part])]
@@ -162,6 +160,19 @@ def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environ
         )
     for part in cfg.transfer.keep:
         widen_goal(parts[part], narrow[part], entry)
+
+
+def _goal_entry(env: Environments, name: str) -> slice:
+    """Return the range of an entry in an environment's goal.
+
+    Raises:
+        ValueError: If the goal has no such entry.
+    """
+    layout = env.goal_layout
+    if name not in layout or len(layout) == 1:
+        remedy = f"use one of {', '.join(layout)}" if len(layout) > 1 else "omit it, because the goal has no parts"
+        raise ValueError(f"transfer.goal_entry={name} is not an entry of the task's goal: {remedy}")
+    return layout[name]
 
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:

@@ -1,4 +1,4 @@
-"""Composes the configuration of a run with Hydra, checks it, and completes it to the plan of the run."""
+"""Composes the configuration of a run with Hydra, and completes it to the plan of the run."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -8,9 +8,8 @@ from typing import Any, cast
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_mcp.runs import places, validation
+from torchrl_mcp.runs import places
 from torchrl_mcp.runs.builtin import PREFIX, builtin, locate
 from torchrl_mcp.training import checkpoint
 
@@ -41,32 +40,15 @@ def compose_run(*overrides: str) -> DictConfig:
 
 
 def planned(cfg: DictConfig) -> Plan:
-    """Return the plan of a run.
+    """Return the plan of a run, whose settings have been checked.
 
     Raises:
-        ValueError: As :func:`require_valid` and :func:`.validation.require_used`, or if the pre-training does not
-            exist.
+        ValueError: If the pre-training does not exist.
     """
-    config = require_valid(cfg)
-    validation.require_used(cfg)
-    folders = {name: config[name] for name in ("run_dir", "run_root")}
     initial = initial_networks(cfg)
+    folders = {name: cfg[name] for name in ("run_dir", "run_root")}
     cfg = cast("DictConfig", OmegaConf.merge(cfg, folders, _sizes(cfg, initial)))
     return Plan(cfg, Path(cfg.run_dir), initial, places.stored(cfg))
-
-
-def require_valid(cfg: DictConfig) -> dict[str, Any]:
-    """Check the values of all settings, and return them with references resolved.
-
-    Raises:
-        ValueError: As :func:`.validation.require_valid`, or if a reference between settings cannot be resolved.
-    """
-    try:
-        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
-    except OmegaConfBaseException as error:
-        raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
-    validation.require_valid(config)
-    return config
 
 
 def initial_networks(cfg: DictConfig) -> Path | None:

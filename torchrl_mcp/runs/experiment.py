@@ -1,4 +1,4 @@
-"""Runs from beginning to end: plan, check, lock the folder, build, record, train, evaluate."""
+"""Runs from beginning to end: check, plan, lock the folder, build, record, train, evaluate."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +13,7 @@ from torchrl_mcp.runs import build, lock, places, records
 from torchrl_mcp.runs.configuration import Plan, initial_networks, planned
 from torchrl_mcp.runs.policies import evaluation
 from torchrl_mcp.runs.records import is_complete
-from torchrl_mcp.runs.requirements import require_all
+from torchrl_mcp.runs.requirements import require_all, require_executable
 from torchrl_mcp.runs.trust import read_config, targets, trusting
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.precision import choose
@@ -30,8 +30,8 @@ def train(cfg: DictConfig) -> Path:
         ValueError: If the folder already holds a run, another process uses the folder, no environment has the
             configured task and character, or the configuration lacks the pre-training that transfer needs.
     """
+    require_all(cfg)
     plan = planned(cfg)
-    require_all(plan.cfg)
     with lock.hold(plan.folder), trusting(targets(plan.config)):
         return _train(plan)
 
@@ -79,8 +79,8 @@ def train_or_resume(cfg: DictConfig, *, wait: bool = False) -> Path:
     """
     # Lock the folder first, so that torchrl-mcp-status shows the run as running from the beginning.
     with lock.hold(Path(cfg.run_dir), wait=wait):
+        require_all(cfg)
         plan = planned(cfg)
-        require_all(plan.cfg)
         with trusting(targets(plan.config)):
             return _train_or_resume(plan, cfg.device)
 
@@ -134,7 +134,7 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
         return folder
     records.require_same_character(folder, config)
     cfg.device = device or cfg.device
-    require_all(cfg)
+    require_executable(cfg)
     print(f"{folder} continues{records.elsewhere(folder, cfg)}", flush=True)
     trainer = _restored(cfg, folder)
     records.store(folder, config)

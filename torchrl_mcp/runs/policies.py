@@ -12,9 +12,10 @@ from torchrl_mcp.envs import Imitation
 from torchrl_mcp.evaluation.clips import ClipResult, follow_each
 from torchrl_mcp.evaluation.diagnostics import diagnosed, diagnostics
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
-from torchrl_mcp.runs import places, requirements
+from torchrl_mcp.runs import places
 from torchrl_mcp.runs.build import Agent, make_agent, make_env
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.imports import require_known
 from torchrl_mcp.runs.publish import fingerprints, publish, take_shared
 from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.run_folder import MODES
@@ -31,7 +32,7 @@ def policy_config(path: Path) -> DictConfig:
     """
     file = checkpoint.find(path)
     config = checkpoint.saved_config(file)
-    requirements.require_known(config, file)
+    require_known(config, file)
     return OmegaConf.create(dict(config))
 
 

@@ -8,13 +8,15 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mcp.runs import places
 from torchrl_mcp.runs.identity import SAME_RUN, differences
+from torchrl_mcp.runs.imports import require_known
 from torchrl_mcp.runs.provenance import continuation, machine, provenance
-from torchrl_mcp.runs.requirements import require_known
+from torchrl_mcp.runs.schema import RunSettings
 from torchrl_mcp.runs.trust import read_config, resuming
 from torchrl_mcp.runs.validation import wrong_values
 from torchrl_mcp.training import checkpoint, run_folder
 from torchrl_mcp.training.precision import Precision, choose, name
 from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, PROVENANCE, read_json, replacing, write_json
+from torchrl_mcp.values import types_of
 
 
 def run_config(folder: Path) -> DictConfig:
@@ -141,7 +143,7 @@ def replanned(folder: Path, total_frames: int | None, moves: Mapping[str, str]) 
     config = _stored_config(folder)
     planned = config["training"]["total_frames"]
     total = planned if total_frames is None else total_frames
-    if wrong := list(wrong_values({"training": {"total_frames": total}})):
+    if wrong := list(wrong_values({"training": {"total_frames": total}}, types_of(RunSettings))):
         raise ValueError(wrong[0])
     if total != planned and total < (taken := run_folder.frames(checkpoint.find(folder))):
         raise ValueError(f"training.total_frames={total} must be at least {taken}, the steps that {folder} has taken")

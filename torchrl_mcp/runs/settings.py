@@ -16,8 +16,8 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     >>> list(leaves({"seed": 0, "task": {"near": [1, 2], "mixture": [{"weight": 3}]}}))
     [('seed', 0), ('task.near', [1, 2]), ('task.mixture.0.weight', 3)]
     """
-    for key, value in _items(config):
-        if _is_group(value):
+    for key, value in items(config):
+        if is_group(value):
             yield from leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
@@ -35,15 +35,17 @@ def replaced(config: Any, values: Mapping[str, Any], prefix: str = "") -> Any:
     {'seed': 0, 'task': {'path': 'walks'}}
     """
     changed = {
-        key: replaced(value, values, f"{prefix}{key}.") if _is_group(value) else values.get(f"{prefix}{key}", value)
-        for key, value in _items(config)
+        key: replaced(value, values, f"{prefix}{key}.") if is_group(value) else values.get(f"{prefix}{key}", value)
+        for key, value in items(config)
     }
     return changed if isinstance(config, Mapping) else list(changed.values())
 
 
-def _is_group(value: Any) -> bool:
+def is_group(value: Any) -> bool:
+    """Return whether a value is a group of settings, or a list of groups."""
     return isinstance(value, Mapping) or (isinstance(value, list) and any(isinstance(item, Mapping) for item in value))
 
 
-def _items(group: Any) -> Iterator[tuple[Any, Any]]:
+def items(group: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield the names, or the indices, and the entries of a group."""
     return iter(group.items() if isinstance(group, Mapping) else enumerate(group))

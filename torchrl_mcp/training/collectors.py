@@ -20,6 +20,7 @@ from torchrl_mcp.training import ray_workers
 from torchrl_mcp.training.progress import Stopwatch
 from torchrl_mcp.training.threads import threads, threads_kept
 from torchrl_mcp.training.workers import attend, begun, end, end_with_parent, new_workers
+from torchrl_mcp.values import Count, Whole
 
 PATIENCE = 5.0
 """Seconds that workers have to end before they are killed."""
@@ -52,7 +53,7 @@ class TrajectorySource(Protocol):
     """
 
     env: Environments
-    num_envs: int
+    num_envs: Count
     resumes_episodes: bool
 
     def start(self, policy: TensorDictModuleBase, batches: Batches) -> None:
@@ -150,7 +151,7 @@ class LocalSource:
         self.env.load_state_dict(state)
 
 
-def local(make_env: Callable[..., Environments], *, num_envs: int, seed: int) -> LocalSource:
+def local(make_env: Callable[..., Environments], *, num_envs: Count, seed: int) -> LocalSource:
     """Return a source in this process with the environments of ``make_env(num_envs=, seed=)``."""
     return LocalSource(make_env(num_envs=num_envs, seed=seed))
 
@@ -164,7 +165,7 @@ class RemoteSource:
         make_env: Picklable function that makes the environments of one worker, called as
             ``make_env(num_envs=, seed=, num_threads=)``.
         num_envs: Number of environments of all workers together, ``N``.
-        seed: Seed of environments and exploration, from which the workers' seeds are derived.
+        seed: int of environments and exploration, from which the workers' seeds are derived.
         num_workers: Number of workers.
         num_threads: Number of physics threads per worker.
         backend: Backend of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``,
@@ -181,10 +182,10 @@ class RemoteSource:
         self,
         make_env: Callable[..., Environments],
         *,
-        num_envs: int,
+        num_envs: Count,
         seed: int,
-        num_workers: int,
-        num_threads: int,
+        num_workers: Count,
+        num_threads: Whole,
         backend: str = "process",
         backend_options: Mapping[str, Any] | None = None,
     ) -> None:

@@ -6,8 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_mcp.values import Period, Positive
 
-def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: float, **kwargs: Any) -> torch.optim.Adam:
+
+def layerwise_adam(
+    parameters: Iterable[Tensor], *, lr: Positive, inputs: Period, fused: bool, **kwargs: Any
+) -> torch.optim.Adam:
     r"""Return Adam whose step size for the weights of a layer with :math:`n` inputs is :math:`\alpha \min(1, m / n)`.
 
     Adam moves every weight by about the step size, however small the gradient. The inputs of a layer after rectifiers
@@ -19,6 +23,7 @@ def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: float, **
         parameters: Parameters of linear layers: weights ``(outputs, n)`` and biases ``(outputs,)``.
         lr: Step size :math:`\alpha` of biases and of layers with at most ``inputs`` inputs.
         inputs: Number of inputs :math:`m` above which steps are smaller; infinity for equal steps.
+        fused: Whether to update all parameters in one kernel.
         **kwargs: Other arguments of :class:`torch.optim.Adam`.
 
     Reference:
@@ -29,4 +34,4 @@ def layerwise_adam(parameters: Iterable[Tensor], *, lr: float, inputs: float, **
     for parameter in parameters:
         share = min(1.0, inputs / parameter.shape[1]) if parameter.ndim > 1 else 1.0
         groups.setdefault(lr * share, []).append(parameter)
-    return torch.optim.Adam([{"params": group, "lr": size} for size, group in groups.items()], **kwargs)
+    return torch.optim.Adam([{"params": group, "lr": size} for size, group in groups.items()], fused=fused, **kwargs)

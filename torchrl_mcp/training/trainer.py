@@ -10,12 +10,11 @@ from torchrl.checkpoint import Checkpoint
 
 from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.modules import RunningNormaliser
-from torchrl_mcp.training.bar import TrainingBar
 from torchrl_mcp.training.checkpoint import RunRandomness, load, rotation, run_checkpoint, save
 from torchrl_mcp.training.collectors import Batches, TrajectorySource
 from torchrl_mcp.training.episodes import EpisodeStatistics
 from torchrl_mcp.training.metrics import MetricsWriter
-from torchrl_mcp.training.progress import Progress, Stopwatch
+from torchrl_mcp.training.progress import Progress, Stopwatch, TrainingBar
 from torchrl_mcp.training.run_folder import NORMALISED_RETURN
 from torchrl_mcp.training.update import Agent, Objective, PPOSettings, Update
 

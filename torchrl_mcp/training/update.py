@@ -19,6 +19,7 @@ from torchrl_mcp.objectives.actor_loss import require_reports
 from torchrl_mcp.training.dead_units import DeadUnits
 from torchrl_mcp.training.threads import side_by_side
 from torchrl_mcp.training.transfer import FrozenParts
+from torchrl_mcp.values import Count, Positive, Whole
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class PPOSettings:
         ValueError: If ``frames_per_batch`` is not a multiple of ``num_envs`` and of ``minibatch_size``.
     """
 
-    num_envs: int
-    total_frames: int
-    frames_per_batch: int
-    minibatch_size: int
-    num_epochs: int
-    warmup_batches: int
-    max_grad_norm: float | None
-    checkpoint_interval: int
+    num_envs: Count
+    total_frames: Count
+    frames_per_batch: Count
+    minibatch_size: Count
+    num_epochs: Count
+    warmup_batches: Whole
+    max_grad_norm: Positive | None
+    checkpoint_interval: Count
     autocast: bool
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from torchrl_mcp.training.bar import TrainingBar
+from torchrl_mcp.training.progress import TrainingBar
 
 
 class Terminal(io.StringIO):
