@@ -169,21 +169,28 @@ def test_every_number_flag_and_list_has_a_rule(words):
 
 
 class Bench(Heading):
-    """A task of a user, which passes two of its arguments on."""
+    """A task of a user, which passes arguments on to its bases."""
 
-    def __init__(self, character, num_envs, *, places: Count, max_episode_steps=20, speed=1.0, **kwargs):
-        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, speed=speed, **kwargs)
+    def __init__(self, character, num_envs, *, places: Count, fast: bool = None, speed=1.0, **kwargs):  # noqa: RUF013
+        super().__init__(character, num_envs, speed=speed, **kwargs)
 
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("places", 0), ("max_episode_steps", 0), ("speed", -1.0), ("physics_timestep", 0.0), ("curriculum.discount", 2)],
+    [
+        ("places", 0),
+        ("fast", 2),
+        ("max_episode_steps", 0),
+        ("speed", -1.0),
+        ("physics_timestep", 0.0),
+        ("curriculum.discount", 2),
+    ],
 )
 @pytest.mark.parametrize("group", ["transfer", "evaluation"])
 def test_the_arguments_of_a_user_s_task_have_the_rules_of_its_signature_and_of_its_bases(setting, value, group):
     cfg = composed(*place("mcp", "heading")).copy()
     OmegaConf.set_struct(cfg, False)
-    cfg.task.transfer = {"_target_": f"{__name__}.Bench", "_partial_": True, "places": 3}
+    cfg.task.transfer = {"_target_": f"{__name__}.Bench", "_partial_": True, "places": 3, "fast": None}
     require_valid(cfg)
     OmegaConf.update(cfg, f"task.{group}.{setting}", value, force_add=True)
     refused(lambda: require_valid(cfg), f"task.{group}.{setting}={value}")
