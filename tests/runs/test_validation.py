@@ -119,6 +119,11 @@ def test_all_wrong_values_are_named_at_once_and_no_folder_is_made(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_evaluation_of_a_task_without_the_stage_has_the_rules_of_the_other_stage():
+    cfg = composed("task=heading", "stage=pretrain", "task.evaluation.speed=0")
+    refused(lambda: require_valid(cfg), "task.evaluation.speed=0")
+
+
 def test_a_missing_value_is_asked_for():
     cfg = composed("task=imitation", "motions=folder")
     refused(lambda: require_valid(cfg), "motions.path")
