@@ -119,6 +119,11 @@ def test_all_wrong_values_are_named_at_once_and_no_folder_is_made(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_evaluation_of_a_task_without_the_stage_has_the_rules_of_the_other_stage():
+    cfg = composed("task=heading", "stage=pretrain", "task.evaluation.speed=0")
+    refused(lambda: require_valid(cfg), "task.evaluation.speed=0")
+
+
 def test_a_missing_value_is_asked_for():
     cfg = composed("task=imitation", "motions=folder")
     refused(lambda: require_valid(cfg), "motions.path")
@@ -169,21 +174,28 @@ def test_every_number_flag_and_list_has_a_rule(words):
 
 
 class Bench(Heading):
-    """A task of a user, which passes two of its arguments on."""
+    """A task of a user, which passes arguments on to its bases."""
 
-    def __init__(self, character, num_envs, *, places: Count, max_episode_steps=20, speed=1.0, **kwargs):
-        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, speed=speed, **kwargs)
+    def __init__(self, character, num_envs, *, places: Count, fast: bool = None, speed=1.0, **kwargs):  # noqa: RUF013
+        super().__init__(character, num_envs, speed=speed, **kwargs)
 
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("places", 0), ("max_episode_steps", 0), ("speed", -1.0), ("physics_timestep", 0.0), ("curriculum.discount", 2)],
+    [
+        ("places", 0),
+        ("fast", 2),
+        ("max_episode_steps", 0),
+        ("speed", -1.0),
+        ("physics_timestep", 0.0),
+        ("curriculum.discount", 2),
+    ],
 )
 @pytest.mark.parametrize("group", ["transfer", "evaluation"])
 def test_the_arguments_of_a_user_s_task_have_the_rules_of_its_signature_and_of_its_bases(setting, value, group):
     cfg = composed(*place("mcp", "heading")).copy()
     OmegaConf.set_struct(cfg, False)
-    cfg.task.transfer = {"_target_": f"{__name__}.Bench", "_partial_": True, "places": 3}
+    cfg.task.transfer = {"_target_": f"{__name__}.Bench", "_partial_": True, "places": 3, "fast": None}
     require_valid(cfg)
     OmegaConf.update(cfg, f"task.{group}.{setting}", value, force_add=True)
     refused(lambda: require_valid(cfg), f"task.{group}.{setting}={value}")

@@ -43,7 +43,12 @@ def argument_types(name: str) -> dict[str, Any]:
     types: dict[str, Any] = {}
     for called in reversed(_called(name)):
         declared = types_of(OTHER_LIBRARIES.get(called, _function(called)))
-        types |= {name: annotation for name, annotation in declared.items() if has_rules(annotation)}
+        parameters = _parameters(called)
+        for argument, annotation in declared.items():
+            # Not every library annotates `flag: bool = None` as optional.
+            is_optional = argument in parameters and parameters[argument].default is None
+            if has_rules(annotation):
+                types[argument] = annotation | None if is_optional else annotation
     return types
 
 

@@ -72,17 +72,21 @@ def types_of_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         config: The resolved configuration of the run.
     """
-    task = config.get("task")
-    stage = config.get("stage")
-    chosen = task.get(stage.get("name")) if isinstance(task, Mapping) and isinstance(stage, Mapping) else None
-    target = chosen.get("_target_") if isinstance(chosen, Mapping) else None
-    environment = argument_types(str(target)) if target else {}
+    environment = argument_types(_environment(config))
     stages = dict.fromkeys(("pretrain", "transfer", "evaluation"), environment)
     return {
         **types_of(RunSettings),
         "task": {**types_of(Task), **stages},
         "evaluation": {**types_of(Evaluation), "environment": environment},
     }
+
+
+def _environment(config: Mapping[str, Any]) -> str:
+    """Return the name of the class of a run's environments; without environments for the stage, of the other stage."""
+    stage = config["stage"].get("name") if isinstance(config.get("stage"), Mapping) else None
+    task = config["task"] if isinstance(config.get("task"), Mapping) else {}
+    groups = [task.get(name) for name in (stage, "pretrain", "transfer")]
+    return next((str(group["_target_"]) for group in groups if isinstance(group, Mapping) and "_target_" in group), "")
 
 
 def wrong_values(settings: Any, types: Any) -> Iterator[str]:
