@@ -16,7 +16,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Prepare docstrings before they are parsed."""
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-docstring", prepare, priority=BEFORE_NAPOLEON)
-    app.connect("autodoc-before-process-signature", plain_types)
+    app.connect("autodoc-skip-member", plain_types)
     app.connect("autodoc-process-signature", constructor)
     app.connect("doctree-read", without_object)
     return {"parallel_read_safe": True}
@@ -37,12 +37,18 @@ def prepare(app: Sphinx, what: str, name: str, obj: object, options: object, lin
     lines[:] = converted
 
 
-def plain_types(app: Sphinx, obj: object, bound_method: bool) -> None:
-    """Leave out the rules in the types of parameters, whose words Sphinx would take for names."""
-    for function in (obj, inspect.unwrap(obj)) if callable(obj) else ():
-        if inspect.isfunction(function):
-            with suppress(NameError, TypeError):
-                function.__annotations__ = get_type_hints(function)
+def plain_types(app: Sphinx, what: str, name: str, obj: Any, *_: Any) -> None:
+    """Leave out the rules in the types of parameters and fields, whose words Sphinx would take for names.
+
+    This happens when autodoc asks whether to skip a member: later, it has already read the types of some classes.
+    """
+    owners = list(obj.__mro__) if inspect.isclass(obj) else []
+    functions = [vars(owner).get("__init__") for owner in owners] or [obj]
+    functions = [function for function in functions if inspect.isfunction(function)]
+    for annotated in (*owners, *functions, *map(inspect.unwrap, functions)):
+        with suppress(NameError, TypeError, AttributeError):
+            types = get_type_hints(annotated)
+            annotated.__annotations__ = {key: types[key] for key in inspect.get_annotations(annotated)}
 
 
 def constructor(

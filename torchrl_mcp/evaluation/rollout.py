@@ -129,7 +129,7 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
         normalised_return: The task's normalisation of returns.
 
     Returns:
-        Means over episodes: ``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
+        Means over episodes of ``normalised_return``, ``return``, ``length`` in control steps, ``terminated`` as a
         fraction, ``metrics``, and ``durations`` of flags in control steps. ``normalised_return_std`` is the standard
         deviation over episodes, and ``interval`` the 95 % percentile bootstrap interval of the mean of the normalised
         return; both are 0 wide for a single episode. ``reach``, which some tasks have, contains the returns of

@@ -160,7 +160,7 @@ class Update:
         return self.learn(samples, warming_up=warming_up)
 
     def learn(self, samples: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
-        """Learn from samples of any batch shape that already have advantages; else as :meth:`__call__`."""
+        """Learn from samples of any batch shape that already have advantages; else as ``__call__``."""
         actor = self.agent.actor
         keys = ["observation", "goal", actor.sampled, actor.log_prob, *actor.stored]
         samples = samples.select(*keys, *self.objective.advantages.out_keys).flatten()
