@@ -34,7 +34,7 @@ PACKAGES = {"torchrl_mcp": ROOT / "torchrl_mcp", "torchrl_mcp.envs": ROOT / "env
 
 BLOCK = re.compile(r"^```(python|pycon)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"^```\{code-block\} \w+\n:caption: (.*?)\n\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-SHOWN = re.compile(r"^```\{literalinclude\} ([\w.]+)$", re.MULTILINE)
+SHOWN = re.compile(r"^```\{literalinclude\} (\w[\w./]+)$", re.MULTILINE)
 """Files beside a page that it shows."""
 COMMAND = re.compile(r"^(?:PYTHONPATH=\. )?torchrl-mcp-train ((?:.*\\\n)*.*)$", re.MULTILINE)
 INCLUDE = re.compile(r"```\{include\} (\S+)\n(.*?)```", re.DOTALL)
@@ -103,7 +103,8 @@ def test_the_code_of_a_tutorial_runs_from_top_to_bottom_and_its_commands_find_it
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(content)
     for name in SHOWN.findall(text):
-        shutil.copy(tutorial.with_name(name), name)
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(tutorial.parent / name, name)
 
     run(tutorial, module.__dict__)
 
