@@ -22,7 +22,7 @@ class CheetahSpeeds(HalfCheetahEnv):
     """
 
     def __init__(self, speeds: Sequence[float], **kwargs: Any) -> None:
-        super().__init__(**kwargs)
+        super().__init__(camera_name="track", **kwargs)
         self.speeds = list(speeds)
         self.number = 0
         self.observation_space = Dict(
