@@ -65,6 +65,16 @@ def test_however_the_files_of_runs_are_damaged_the_others_are_reported(write_run
     assert [run.state for run in runs if run.path.name == "whole"] == ["complete"]
 
 
+@pytest.mark.parametrize(("key", "value"), [("normalised_return", math.nan), ("interval", [0.25, math.inf])])
+def test_a_run_whose_evaluation_is_not_finite_is_damaged(write_run, key, value):
+    folder = write_run("run", score=0.5)
+    content = json.loads((folder / "evaluation.json").read_text())
+    content["stochastic"][key] = value
+    (folder / "evaluation.json").write_text(json.dumps(content))
+    (run,) = find_runs([folder])[0]
+    assert run.state == "damaged"
+
+
 def test_what_the_environment_holds_does_not_get_into_a_report(write_run, tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "swordfish")
     write_run("received", score=0.5, method__title="${oc.env:SECRET}")
