@@ -429,7 +429,7 @@ FAULTS = {
         (
             "SeedSequence((self.seed, self._starts))",
             "SeedSequence((self.seed, 0))",
-            "training/test_collectors.py::test_a_run_resumed_with_workers_begins_other_episodes_and_ends",
+            "training/test_collectors.py::test_workers_that_start_again_have_other_seeds",
         ),
         (
             "if num_envs % num_workers",

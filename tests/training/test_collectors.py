@@ -97,6 +97,21 @@ def test_a_run_resumed_with_workers_begins_other_episodes_and_ends(run, tmp_path
     assert resumed[1]["reward"] != whole[1]["reward"]
 
 
+def test_workers_that_start_again_have_other_seeds(tmp_path, monkeypatch):
+    cfg = configure(tmp_path, "method=scratch")
+    source = RemoteSource(partial(build.make_env, cfg), num_envs=4, seed=3, num_workers=2, num_threads=1)
+    seeds = []
+
+    def begin(make_collector):
+        seeds.extend(maker.keywords["seed"] for maker in make_collector.args[0])
+
+    monkeypatch.setattr(source, "_begin", begin)
+    policy = build.make_agent(cfg, source.env).actor.policy
+    for _ in range(2):
+        source.start(policy, Batches(80, torch.device("cpu"), autocast=False, stopwatch=Stopwatch()))
+    assert len(set(seeds)) == 4
+
+
 @pytest.mark.parametrize(("source", "written"), [(LocalSource, "processes or ray"), (RemoteSource, "local")])
 def test_a_source_refuses_the_state_of_another_kind(source, written):
     state = {"starts": 1} if source is LocalSource else {"env": {}}

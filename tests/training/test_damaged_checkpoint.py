@@ -14,6 +14,7 @@ from torch import nn
 
 from torchrl_mcp.training.checkpoint import (
     find,
+    is_intact,
     load,
     load_parts,
     run_checkpoint,
@@ -51,6 +52,13 @@ def archive(**members):
         for name, content in members.items():
             zipped.writestr(name, content)
     return file.getvalue()
+
+
+def test_a_checkpoint_with_a_flipped_bit_in_a_tensor_is_not_intact(saved_run):
+    path = find(saved_run)
+    assert is_intact(path)
+    path.write_bytes(flip(path.read_bytes(), "tensor"))
+    assert not is_intact(path)
 
 
 @pytest.mark.parametrize(
