@@ -85,7 +85,10 @@ def test_an_interpolation_is_neither_followed_nor_accepted(tmp_path, monkeypatch
 BOMB = "\n".join(["a0: &a0 [x]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)])
 
 
-@pytest.mark.parametrize("content", [BOMB, "[" * 5000, "a: " + "x" * 2**21, "a: [", "- 1", "a: 1\na: 2"])
+DEEP = ["a: " + "[" * 150 + "]" * 150, "[" * 500_000, "- " * 500_000, "? " * 500_000]
+
+
+@pytest.mark.parametrize("content", [*DEEP, BOMB, "a: " + "x" * 2**21, "a: [", "- 1", "a: 1\na: 2"], ids=range(9))
 def test_what_is_no_configuration_is_refused_within_seconds(tmp_path, content):
     file = tmp_path / "config.yaml"
     file.write_text(content)

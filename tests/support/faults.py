@@ -616,8 +616,8 @@ FAULTS = {
     "torchrl_mcp/runs/trust.py": [
         ('if any("${" in f"{name}{value}" for name, value in leaves(config))', "if False", "runs/test_trust.py"),
         ("if path.stat().st_size > LARGEST", "if False", "runs/test_trust.py"),
-        ("if _depth(text) > DEEPEST", "if False", "runs/test_trust.py"),
-        ('if "*" in text and', "if False and", "runs/test_trust.py"),
+        ("if depth > DEEPEST", "if False", "runs/test_trust.py"),
+        ("if isinstance(event, yaml.AliasEvent)", "if False", "runs/test_trust.py"),
     ],
     # Reports
     "torchrl_mcp/report/cell.py": [

@@ -11,7 +11,6 @@ from contextvars import ContextVar
 from functools import cache
 from glob import glob
 from importlib.resources import files
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ LARGEST = 2**20
 """Most bytes of a configuration file. The configuration of a run has about ten thousand bytes."""
 
 DEEPEST = 100
-"""Deepest nesting of brackets in a configuration file. In the configuration of a run, the depth is about five."""
+"""Deepest nesting of settings in a configuration file. In the configuration of a run, the depth is about five."""
 
 GET_CLASS = "hydra.utils.get_class"
 """Hydra's function that returns a class, for configurations that pass a class as an argument."""
@@ -121,12 +120,8 @@ def read_config(path: Path) -> dict[str, Any]:
     if path.stat().st_size > LARGEST:
         raise ValueError(f"{path} has more than {LARGEST} bytes: it cannot be a configuration")
     text = path.read_text(encoding="utf-8")
-    if _depth(text) > DEEPEST:
-        raise ValueError(f"{path} is not a configuration: brackets are nested more than {DEEPEST} deep")
     try:
-        # With aliases of aliases, a few lines could expand to more than the memory.
-        if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ValueError(f"{path} has been changed: it contains YAML aliases, which training never writes")
+        _require_plain(text, path)
         config = yaml.load(text, _Loader)
     except (yaml.YAMLError, RecursionError) as error:
         first = str(error).partition("\n")[0] or type(error).__name__
@@ -136,9 +131,20 @@ def read_config(path: Path) -> dict[str, Any]:
     return config
 
 
-def _depth(text: str) -> int:
-    """Return the depth of nested brackets in a text."""
-    return max(accumulate((letter in "[{") - (letter in "]}") for letter in text), default=0)
+def _require_plain(text: str, path: Path) -> None:
+    """Check that loading a text needs neither much memory nor a deep stack, which the parser in C does not limit.
+
+    Raises:
+        ValueError: If the text has aliases, of which a few lines could expand to more than the memory, or is nested too
+            deeply.
+    """
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{path} has been changed: it contains YAML aliases, which training never writes")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ValueError(f"{path} is not a configuration: it is nested more than {DEEPEST} deep")
 
 
 def _may_be_built(name: str) -> bool:
