@@ -219,6 +219,16 @@ def test_an_ablation_holds_the_cells_that_differ_in_its_setting_alone(write_mcp,
     assert all(cell.runs[0].total_frames == 1000 for cell in found.cells)
 
 
+@pytest.mark.parametrize(("actor", "num_cells"), [("own.Actor", 1), ("own.Explorer", 2)])
+def test_the_choice_of_exploration_separates_only_runs_whose_actor_explores_by_it(write_run, actor, num_cells):
+    """The group ``exploration`` is in all configurations, but some methods have an actor of their own."""
+    explorer = {"actor___target_": actor, "exploration__actor___target_": "own.Explorer"}
+    folders = [
+        write_run(f"{std}", seed=seed, exploration__actor__std=std, **explorer) for seed, std in enumerate((0.5, 1.0))
+    ]
+    assert len(grouped(*folders)) == num_cells
+
+
 def test_training_the_primitives_as_well_is_an_ablation_of_transfer_alone(write_mcp):
     variants = [{}, {"transfer__freeze": ["observation_normaliser"]}]
     folders = [write_mcp(f"{s}-{i}", stage=s, **v) for s in ("transfer", "pretrain") for i, v in enumerate(variants)]

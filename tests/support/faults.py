@@ -340,7 +340,7 @@ FAULTS = {
     ],
     "envs/motions/capture/smpl.py": [
         ('up="y" if', 'up="z" if', "envs/motions/capture/test_smpl.py"),
-        ("translations[:, 0] += root", "translations[:, 0] = root", "envs/motions/capture/test_smpl.py"),
+        ("translations[:, 0] += root", "pass", "envs/motions/capture/test_smpl.py"),
     ],
     "envs/motions/capture/retarget.py": [
         (
@@ -533,7 +533,11 @@ FAULTS = {
             "), saved[0])",
             "runs/test_faults.py::test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_one_before",
         ),
-        ("if changed := records.changes(folder, plan.config)", "if changed := []", BODY),
+        (
+            "if changed := records.changes(folder, plan.config)",
+            "if changed := []",
+            "commands/test_sweep.py::test_the_folder_of_a_run_with_other_settings_is_refused_and_left_alone",
+        ),
     ],
     "torchrl_mcp/runs/records.py": [
         (
