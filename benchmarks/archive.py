@@ -185,7 +185,9 @@ def times(of_task: Sequence[Cell]) -> Iterator[dict[str, Any]]:
     of steps with a success is half of the highest final share; the column is omitted for archives without this share.
     """
     ends_at_success = any("success" in cell.metrics for cell in of_task)
-    quantity, share_of_best, name = (SUCCESS, 0.5, "to half") if ends_at_success else (NORMALISED_RETURN, 0.8, "to 0.8")
+    quantity = SUCCESS if ends_at_success else NORMALISED_RETURN
+    share_of_best = 0.5 if ends_at_success else 0.8
+    name = "to half" if ends_at_success else "to 0.8"
     curves = [learning_curve(cell, quantity) for cell in of_task]
     final = [float(curve.mean[-1]) for curve in curves if curve]
     for cell, curve in zip(of_task, curves, strict=True):

@@ -31,7 +31,7 @@ def main() -> None:
         print(table)
         curves = [curve for cell in groups if cell.stage == "transfer" and (curve := learning_curve(cell))]
         figure = draw_curves(curves, ylabel="normalised return in training")
-        figure.axes[0].set_xlim(0, sorted(float(curve.frames[-1]) for curve in curves)[0])
+        figure.axes[0].set_xlim(0, min(float(curve.frames[-1]) for curve in curves))
         save_figure(figure, output / "new_speeds")
         write(output / "runs.csv", [row for cell in groups for run in cell.complete for row in rows(cell, run)])
 

@@ -259,8 +259,8 @@ def _same_kind(value: Any, choice: Any) -> bool:
 
 
 def _any_of(rules: Sequence[Rule | None]) -> Rule | None:
-    known = [rule for rule in rules if rule is not None]
-    if len(known) < len(rules):
+    alternatives = [rule for rule in rules if rule is not None]
+    if len(alternatives) < len(rules):
         return None
-    words = ", or ".join(dict.fromkeys(rule.words for rule in known))
-    return Rule(words, lambda value: any(rule.allows(value) for rule in known))
+    words = ", or ".join(dict.fromkeys(rule.words for rule in alternatives))
+    return Rule(words, lambda value: any(rule.allows(value) for rule in alternatives))

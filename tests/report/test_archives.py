@@ -369,3 +369,20 @@ def test_the_published_ablations_make_their_table(tmp_path):
     for key, cell in shown.items():
         share = f", {mean(each['metrics']['success'] for each in found[key]):.0%}" if key[-1] == "dribble" else ""
         assert cell == f"{normalised_return(found[key]):.3f}{share} ({len(found[key])})"
+
+
+def test_the_published_table_of_the_cheetah_has_the_means_of_the_archived_evaluations(tmp_path):
+    folder = unpack(PUBLISHED / "cheetah" / "runs.tar.xz", tmp_path)
+    returns = defaultdict(list)
+    for path in folder.rglob("evaluation.json"):
+        stage, method = path.relative_to(folder).parts[1:3]
+        returns[stage, method].append(json.loads(path.read_text())["deterministic"])
+    head, *lines = cells_of((PUBLISHED / "cheetah" / "table.md").read_text())
+    assert len(lines) == 7
+    for line in lines:
+        row = dict(zip(head, line, strict=True))
+        method = row[""].lower().replace(" ", "_").replace("-", "_")
+        for stage, column in (("pretrain", "at the seven speeds"), ("transfer", "at the new speeds")):
+            found = returns[stage, method]
+            assert row[column].partition(" ")[0] == (f"{normalised_return(found):.3f}" if found else "")
+            assert len(found) == (0 if (stage, method) == ("pretrain", "scratch") else 3)
