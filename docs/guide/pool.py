@@ -37,9 +37,11 @@ class Pool(EnvBase):
         return TensorDict(observation=self.observed.clone(), batch_size=self.batch_size)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observed, *results, _ = self.pool.step(tensordict["action"].double().numpy())
+        observed, rewards, terminations, truncations, _ = self.pool.step(tensordict["action"].double().numpy())
         self.observed = torch.as_tensor(observed).float()
-        reward, terminated, truncated = (torch.as_tensor(result).unsqueeze(-1) for result in results)
+        reward = torch.as_tensor(rewards).unsqueeze(-1)
+        terminated = torch.as_tensor(terminations).unsqueeze(-1)
+        truncated = torch.as_tensor(truncations).unsqueeze(-1)
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         return TensorDict(ends, batch_size=self.batch_size).update(
             {"observation": self.observed.clone(), "reward": reward.float()}

@@ -157,7 +157,8 @@ class Imitation(PDCharacterEnv):
         self._horizontal = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device=self.device)
         model = self.simulation.model
         bodies = slice(1, 1 + len(self._bodies))
-        masses, centres = (torch.from_numpy(field[bodies]) for field in (model.body_mass, model.body_ipos))
+        masses = torch.from_numpy(model.body_mass[bodies])
+        centres = torch.from_numpy(model.body_ipos[bodies])
         self._masses = masses.to(self.device)
         self._centres_of_mass = centres.to(self.device)
         self.make_specs()

@@ -22,7 +22,8 @@ def draw_bars(picture: Image.Image, weights: Sequence[float], title: str) -> Non
     row = round(picture.height * ROW)
     length = round(picture.height * LENGTH)
     font = ImageFont.load_default(0.8 * row)
-    left, top = 2 * row, 2 * row
+    left = 2 * row
+    top = 2 * row
     gap = max(1, row // 6)
     plate = (row // 2, row // 3, left + length + row // 2, top + len(weights) * row + row // 3)
     corner = picture.crop(plate)
