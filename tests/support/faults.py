@@ -564,7 +564,7 @@ FAULTS = {
         ("len(value) == 2 and value[0] <= value[1]", "len(value) == 2", VALUE),
         ("is_whole(item) and item >= 1) and len(value) > 0", "is_whole(item) and item >= 1)", VALUE),
         ("isinstance(value, bool) == isinstance(choice, bool)", "True", "test_values.py"),
-        ("if len(known) < len(rules):", "if False:", "test_values.py"),
+        ("if len(alternatives) < len(rules):", "if False:", "test_values.py"),
         ("                require(name, value, types_of(function).get(name))", "                pass", ARGUMENT),
     ],
     "torchrl_mcp/runs/validation.py": [
