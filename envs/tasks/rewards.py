@@ -206,18 +206,21 @@ def training_reward(
     weights: Sequence[float],
     speed: float,
     discount: float,
+    ends: bool,
 ) -> Tensor:
     r"""Reward for training to carry and dribble: about zero for standing still, and greatest for a success.
 
     .. math::
         r' = \begin{cases}
-            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success, which ends the episode} \\
+            \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success that ends the episode} \\
+            \sum_i w_i - r_{idle} & \text{in every step in success, if episodes continue} \\
             r - r_{idle} & \text{else}
         \end{cases}
 
-    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success is
-    worth the discounted return of all terms being 1 for ever: otherwise a character that walks on knocks the box off
-    the target, and a success is worth little.
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success
+    that ends the episode is worth the discounted return of all terms being 1 for ever: otherwise a character that walks
+    on knocks the box off the target, and a success is worth little. If episodes continue, only a character that stays
+    in success for ever earns as much.
 
     Args:
         reward: :func:`transport_reward` with these weights, shape ``(*B)``.
@@ -225,9 +228,11 @@ def training_reward(
         weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
         speed: Target speed :math:`\hat{v}`, in m/s, for the :func:`idle_reward`.
         discount: Discount factor :math:`\gamma` of the learner, below 1.
+        ends: Whether a success ends the episode.
 
     Returns:
         Reward, shape ``(*B)``.
     """
     idle = idle_reward(weights, speed)
-    return (reward - idle).masked_fill(success, (sum(weights) - idle) / (1 - discount))
+    best = sum(weights) - idle
+    return (reward - idle).masked_fill(success, best / (1 - discount) if ends else best)

@@ -8,6 +8,7 @@ import torch
 from refusals import refused
 
 from torchrl_mcp.envs import Carry, Dribble, Heading
+from torchrl_mcp.envs.curriculum import SuccessShare
 
 WEIGHTS = [0.6, 0.1, 1.0, 2.0]
 WEIGHED = {"reward_weights": WEIGHTS}
@@ -71,6 +72,86 @@ def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
     assert others > 0
 
 
+AT_THE_TARGET = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
+
+
+def stand(env, state):
+    """Step simulations in which the character stands, and begin new episodes after ended ones."""
+    taken, state = env.step_and_maybe_reset(state.set("action", torch.zeros(env.action_spec.shape)))
+    return taken["next"], state
+
+
+def test_if_episodes_continue_every_step_in_success_earns_the_full_reward():
+    env = make(Dribble, curriculum={**WEIGHED, "after_success": "continue"}, **AT_THE_TARGET)
+    full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
+    state = env.reset()
+    for _ in range(3):
+        outcome, state = stand(env, state)
+        assert outcome["success"].all()
+        assert not outcome["terminated"].any()
+        torch.testing.assert_close(outcome["reward"], torch.full((4, 1), full))
+
+
+@pytest.fixture
+def staged():
+    """Make simulations in which every episode succeeds in its first step, and may go on once most have succeeded."""
+
+    def of(**kwargs):
+        curriculum = {**WEIGHED, "after_success": "staged"}
+        return make(Dribble, 64, curriculum=curriculum, **{**AT_THE_TARGET, **kwargs})
+
+    return of
+
+
+def test_staged_episodes_end_at_a_success_until_most_have_succeeded(staged):
+    env = staged()
+    state = env.reset()
+    ended = []
+    for _ in range(14):
+        outcome, state = stand(env, state)
+        assert outcome["success"].all()
+        ended.append(outcome["terminated"].all().item())
+        assert ended[-1] == outcome["terminated"].any()
+    steps = next(steps for steps in range(1, 100) if 1 - math.exp(-64 * steps / 1000) > 0.5)  # each ends 64 episodes
+    assert ended == [True] * steps + [False] * (14 - steps)
+
+
+def test_staged_episodes_keep_ending_at_a_success_while_most_fail(staged):
+    env = staged(target_distances=(9.0, 10.0), max_episode_steps=1)
+    state = env.reset()
+    for _ in range(30):
+        outcome, state = stand(env, state)
+        assert outcome["truncated"].all()
+        assert not outcome["success"].any()
+    assert env.ends_at_success
+
+
+def test_a_restored_environment_continues_in_the_stage_in_which_it_was(staged):
+    first = staged()
+    state = first.reset()
+    for _ in range(13):
+        _, state = stand(first, state)
+    second = staged()
+    assert second.ends_at_success
+    second.load_state_dict(first.state_dict())
+    outcome, _ = stand(second, second.reset())
+    assert not outcome["terminated"].any()
+
+
+def test_a_share_of_successes_is_a_mean_in_which_old_episodes_weigh_less():
+    generator = np.random.default_rng(0)
+    share = SuccessShare()
+    outcomes = np.zeros(0)
+    for num in generator.integers(1, 40, size=200):
+        succeeded = generator.random(num) < 0.4
+        share.count(int(num), int(succeeded.sum()))
+        outcomes = np.append(outcomes, np.full(num, succeeded.mean()))
+    weights = np.exp((np.arange(1, len(outcomes) + 1) - len(outcomes)) / 1000)
+    expected = (weights * outcomes).sum() * -math.expm1(-1 / 1000)
+    assert share.share == pytest.approx(expected, rel=1e-9)
+    assert not share.was_reached
+
+
 def test_without_weights_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     outcome = outcomes(make(Dribble, **there), 1)[0][0]
@@ -113,6 +194,7 @@ def test_standing_still_far_from_everything_earns_nothing():
         (Carry, {"reward_weights": [1.0] * 5}, "reward_weights=[1.0, 1.0, 1.0, 1.0, 1.0]"),
         (Heading, {"reward_weights": [1.0] * 4}, "reward_weights=[1.0, 1.0, 1.0, 1.0]"),  # of none
         (Dribble, {"reward_weights": WEIGHTS, "discount": 1}, "discount=1"),
+        (Dribble, {"reward_weights": WEIGHTS, "after_success": "stop"}, "after_success"),
         (Heading, {"discount": 0}, "discount=0"),
         (Heading, {"discount": 1.1}, "discount=1.1"),
         (Heading, {"emphasis": None}, "'emphasis'"),

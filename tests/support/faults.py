@@ -229,6 +229,8 @@ FAULTS = {
     "envs/curriculum.py": [
         ("if self.reward_weights is not None and self.discount == 1", "if False", "envs/test_curriculum.py"),
         ("if not 0 < self.discount <= 1", "if not 0 < self.discount", "envs/test_curriculum.py"),
+        ("-math.expm1(-episodes / self.EPISODES)", "episodes / self.EPISODES", "envs/test_curriculum.py"),
+        ("self.was_reached |= ", "self.was_reached = ", "envs/test_curriculum.py"),
     ],
     "envs/initial_states.py": [
         ("shares < self.in_motion", "shares > self.in_motion", "envs/test_initial_states.py"),
@@ -272,7 +274,8 @@ FAULTS = {
             "target_distance_power",
             "envs/tasks/test_rewards.py envs/tasks/test_transport.py",
         ),
-        ("idle) / (1 - discount)", "idle) / discount", "envs/test_curriculum.py envs/tasks/test_rewards.py"),
+        ("best / (1 - discount)", "best / discount", "envs/test_curriculum.py"),
+        (" if ends else best", "", "envs/test_curriculum.py"),
     ],
     "envs/tasks/heading.py": [
         (
