@@ -27,39 +27,23 @@ install Optuna in a separate environment.
 
 import argparse
 import csv
-import json
-import os
-import platform
-import shutil
-import signal
 import subprocess
-import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from report import write
+from cpu_time import Training, processor, scored
+from report import about, write
 
 SEEDS = (100, 101)
 """Seeds of the trials. Tables use seeds from 0."""
 
-EVALUATION_SEED = "777"
-EPISODES = "128"
-
 PRETRAINED = Path(__file__).parent / "results" / "table2" / "networks"
-
-FIXED = (
-    *("character=biped", "stage=transfer", "autocast=false", "logger=none", "progress_bar=false", "torch_threads=1"),
-    *("num_threads=1", "keep_checkpoints=1", "evaluation.episodes=0", "training.total_frames=1_000_000_000"),
-)
 
 RESULTS = Path(__file__).parent / "results" / "search"
 
 STEPS_PER_CHECKPOINT = 65_536
-
-TICKS = os.sysconf("SC_CLK_TCK")
 
 BATCHES = {"1024": (32, 1024), "4096": (128, 4096), "16384": (512, 16_384)}
 """Numbers of environments and of steps per batch, by the size of the batch."""
@@ -134,91 +118,10 @@ NOISE = {
 """Settings of exploration by name, for every method."""
 
 
-class Training:
-    """A training in a separate process, which stands still between the periods in which it may train.
-
-    Args:
-        words: Arguments of ``torchrl-mcp-train``.
-        folder: The run folder.
-    """
-
-    def __init__(self, words: Sequence[str], folder: Path) -> None:
-        self.folder = folder
-        shutil.rmtree(folder, ignore_errors=True)  # remains of an interrupted trial
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        self.log = folder.with_suffix(".log").open("w")
-        program = Path(sys.executable).with_name("torchrl-mcp-train")
-        self.command = [str(program), *words, *FIXED, f"run_dir={folder}"]
-        self.process = subprocess.Popen(self.command, stdout=self.log, stderr=self.log)
-        self.began = 0.0
-
-    def train_to(self, seconds: float) -> float:
-        """Train until the training has used ``seconds`` of CPU time in total, and return the CPU seconds used.
-
-        Raises:
-            ChildProcessError: If the training ends before.
-        """
-        self.process.send_signal(signal.SIGCONT)
-        used = 0.0
-        while used < seconds:
-            time.sleep(1)
-            if self.process.poll() is not None:
-                raise ChildProcessError(f"{' '.join(self.command)} ended early, see {self.log.name}")
-            if not (self.folder / "config.yaml").exists():
-                self.began = cpu_seconds(self.process.pid)
-            used = cpu_seconds(self.process.pid) - self.began
-        self.process.send_signal(signal.SIGSTOP)
-        return used
-
-    def end(self) -> None:
-        """End the process, and close its log."""
-        self.process.kill()
-        self.process.wait()
-        self.log.close()
-
-
-def cpu_seconds(pid: int) -> float:
-    """Return the CPU seconds of a process with all its threads."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def scored(training: Training, seconds: float) -> dict[str, Any]:
-    """Train until the training has used ``seconds`` of CPU time, evaluate the newest checkpoint, and return numbers."""
-    used = training.train_to(seconds)
-    output = training.folder / f"search-{seconds:.0f}.json"
-    program = Path(sys.executable).with_name("torchrl-mcp-evaluate")
-    words = [program, training.folder, "--episodes", EPISODES, "--seed", EVALUATION_SEED, "--output", output]
-    subprocess.run([str(word) for word in words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    evaluation = json.loads(output.read_text())
-    row: dict[str, Any] = {"cpu_seconds": used}
-    for mode in ("deterministic", "stochastic"):
-        numbers = evaluation[mode]
-        row |= {
-            f"{mode}_return": round(numbers["normalised_return"], 4),
-            f"{mode}_success": numbers["metrics"].get("success"),
-            f"{mode}_success_seconds": round(numbers["durations"].get("success", 0) / 30, 3),
-            f"{mode}_falls": numbers["terminated"],
-        }
-    newest = max(training.folder.glob("checkpoints/checkpoint-*.torchrl"))
-    row["steps"] = int(newest.stem.removeprefix("checkpoint-"))
-    modes = ("deterministic", "stochastic")
-    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in modes)
-    return row
-
-
 def settings_of(task: str, method: str) -> list[str]:
     """Return the settings that all trials of a method in a task share."""
     pretrained = [] if method == "scratch" else [f"pretrained={PRETRAINED / f'{method}-biped-0.torchrl'}"]
-    return [f"task={task}", f"method={method}", *pretrained]
-
-
-def processor() -> str:
-    """Return the name of the processor."""
-    fields = dict(line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line)
-    names = {name.strip(): value.strip() for name, value in fields.items()}
-    family = f"family {names.get('cpu family')} model {names.get('model')}"
-    return f"{names.get('model name', platform.machine())} {family}"
+    return [f"task={task}", f"method={method}", "character=biped", "stage=transfer", *pretrained]
 
 
 def search(task: str, method: str, root: Path, results: Path, *, seconds: float, trials: int) -> None:
@@ -322,7 +225,8 @@ class Table:
 
     def write(self, trial: int | str, seed: int, settings: Sequence[str], numbers: dict[str, Any]) -> None:
         """Add a row, and write the file."""
-        row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings), "processor": processor()}
+        row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings)}
+        row |= {"processor": processor(), "commit": about()["commit"]}
         self.rows.append({name: str(value) for name, value in row.items()})
         write(self.path, self.rows)
 

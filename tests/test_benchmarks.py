@@ -201,9 +201,12 @@ def search(monkeypatch):
 def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_again(
     search, command, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(search.subprocess, "run", lambda words, **_: command("evaluate", *words[1:]))  # no new process
+    cpu_time = sys.modules["cpu_time"]
+    monkeypatch.setattr(
+        cpu_time.subprocess, "run", lambda words, **_: command("evaluate", *words[1:])
+    )  # no new process
     tiny = "preset=smoke training.frames_per_batch=128 task.evaluation.max_episode_steps=10"
-    monkeypatch.setattr(search, "EPISODES", "4")
+    monkeypatch.setattr(cpu_time, "EPISODES", "4")
     monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
     words = ["heading", "scratch", "--minutes", "0.05", "--seeds", "7", "--candidate", f"tiny={tiny}"]
     for _ in range(2):
@@ -222,7 +225,7 @@ def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_ag
 def test_every_method_is_searched_over_settings_that_it_has(search):
     for method, noises in search.NOISE.items():
         for settings in noises.values():
-            words = [*search.settings_of("dribble", method), *search.FIXED, *settings.split()]
+            words = [*search.settings_of("dribble", method), *sys.modules["cpu_time"].FIXED, *settings.split()]
             compose_run(*words, *search.batch_words(32, 1024, minibatches=8, passes=4), "stage.gamma=0.995")
 
 
