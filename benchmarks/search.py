@@ -10,9 +10,10 @@ The protocol is the same for all methods and tasks, in float32 with the biped:
 * A trial is a set of settings, which are arguments of ``torchrl-mcp-train``. Optuna's TPE sampler proposes the
   settings, except for the first two trials: the current defaults, and the defaults with large batches. Every method has
   the same number of trials.
-* A trial trains with the seeds 100 and 101, which no table uses, from one pre-training of the method (5 M steps). A run
-  is stopped after a number of CPU seconds, counted from its first step, so that other work on the machine does not
-  distort the comparison. All trials of a study must run on the same kind of processor, which every row names.
+* A trial trains with the seeds 100 and 101, which no table uses: in imitation from the start, in all other tasks from
+  one pre-training of the method (5 M steps). A run is stopped after a number of CPU seconds, counted from its first
+  step, so that other work on the machine does not distort the comparison. All trials of a study must run on the same
+  kind of processor, which every row names.
 * After half of the time, each seed plays 128 deterministic and 128 exploring episodes of the paper's task. Optuna's
   successive halving (reduction factor 2) ends the trial unless it is in the better half so far. Other trials train to
   the end and are evaluated again. An earlier first evaluation would be unfair: after a quarter of the time, large
@@ -119,9 +120,11 @@ NOISE = {
 
 
 def settings_of(task: str, method: str) -> list[str]:
-    """Return the settings that all trials of a method in a task share."""
-    pretrained = [] if method == "scratch" else [f"pretrained={PRETRAINED / f'{method}-biped-0.torchrl'}"]
-    return [f"task={task}", f"method={method}", "character=biped", "stage=transfer", *pretrained]
+    """Return the settings that all trials of a method in a task share; imitation is pre-training."""
+    stage = "pretrain" if task == "imitation" else "transfer"
+    begins_anew = stage == "pretrain" or method == "scratch"
+    pretrained = [] if begins_anew else [f"pretrained={PRETRAINED / f'{method}-biped-0.torchrl'}"]
+    return [f"task={task}", f"method={method}", "character=biped", f"stage={stage}", *pretrained]
 
 
 def search(task: str, method: str, root: Path, results: Path, *, seconds: float, trials: int) -> None:
@@ -264,6 +267,8 @@ def main(argv: Sequence[str] | None = None, run: Callable[..., None] = search) -
     parser.add_argument("--root", type=Path, default=Path("runs/search"), help="folder of the runs")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the tables")
     arguments = parser.parse_args(argv)
+    if arguments.task == "imitation" and not arguments.candidate:
+        parser.error("the proposed settings are for transfer: give a --candidate for imitation")
     arguments.results.mkdir(parents=True, exist_ok=True)
     study = (arguments.task, arguments.method, arguments.root, arguments.results)
     seconds = 60 * arguments.minutes

@@ -229,6 +229,13 @@ def test_every_method_is_searched_over_settings_that_it_has(search):
             compose_run(*words, *search.batch_words(32, 1024, minibatches=8, passes=4), "stage.gamma=0.995")
 
 
+def test_candidates_of_imitation_begin_from_the_start(search):
+    cfg = compose_run(*search.settings_of("imitation", "mcp"))
+    assert (cfg.stage.name, cfg.pretrained) == ("pretrain", None)
+    with pytest.raises(SystemExit):
+        search.main(["imitation", "mcp", "--minutes", "1"])
+
+
 def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     make_env = runpy.run_path(str(BENCHMARKS / "off_policy.py"))["make_env"]
