@@ -69,8 +69,8 @@ class Curriculum:
     def __post_init__(self) -> None:
         for name, annotation in types_of(type(self)).items():
             require(name, getattr(self, name), annotation)
-        if not 0 < self.discount <= 1:
-            raise ValueError(f"discount={self.discount} is out of range: pass that of the learner, above 0, at most 1")
+        if self.discount == 0:
+            raise ValueError("discount=0 is out of range: pass the discount of the learner, which is above 0")
         if self.reward_weights is not None and self.discount == 1:
             raise ValueError(
                 "reward_weights with discount=1 make a success worth infinite reward: pass a discount below 1"

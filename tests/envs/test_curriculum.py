@@ -152,6 +152,14 @@ def test_a_share_of_successes_is_a_mean_in_which_old_episodes_weigh_less():
     assert not share.was_reached
 
 
+def test_a_share_that_was_reached_remains_so_whatever_comes_next():
+    share = SuccessShare()
+    for successes in (1000, 0, 0):
+        share.count(1000, successes)
+        assert share.was_reached
+    assert share.share < 0.5
+
+
 def test_without_weights_a_success_does_not_end_the_episode():
     there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
     outcome = outcomes(make(Dribble, **there), 1)[0][0]

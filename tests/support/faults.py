@@ -228,7 +228,7 @@ FAULTS = {
     ],
     "envs/curriculum.py": [
         ("if self.reward_weights is not None and self.discount == 1", "if False", "envs/test_curriculum.py"),
-        ("if not 0 < self.discount <= 1", "if not 0 < self.discount", "envs/test_curriculum.py"),
+        ("if self.discount == 0", "if False", "envs/test_curriculum.py"),
         ("-math.expm1(-episodes / self.EPISODES)", "episodes / self.EPISODES", "envs/test_curriculum.py"),
         ("self.was_reached |= ", "self.was_reached = ", "envs/test_curriculum.py"),
     ],
