@@ -37,7 +37,8 @@ class Curriculum:
             ``"end"``: the success ends the episode, and is worth the reward for succeeding for ever.
             ``"continue"``: the episode continues, and every step in success earns its share of that reward, so that the
             character learns to leave the object at the target. ``"staged"``: successes end episodes until more than
-            half of the recent episodes have succeeded, see :class:`SuccessShare`; from then on, episodes continue.
+            half of the recent episodes have succeeded, see
+            :class:`~torchrl_mcp.envs.curriculum.SuccessShare`; from then on, episodes continue.
         target_distance_power: Power of the distance to the target in a reward with ``reward_weights``.
         random_first_length: Whether to shorten the first episodes by different lengths, spread evenly over the
             simulations. Then simulations are at different times of their episodes; otherwise a batch of short
@@ -67,7 +68,7 @@ class Curriculum:
     discount: Share = 0.99
 
     def __post_init__(self) -> None:
-        for name, annotation in types_of(type(self)).items():
+        for name, annotation in types_of(Curriculum.__init__).items():
             require(name, getattr(self, name), annotation)
         if self.discount == 0:
             raise ValueError("discount=0 is out of range: pass the discount of the learner, which is above 0")
@@ -97,8 +98,9 @@ class Curriculum:
 class SuccessShare:
     """The share of recent training episodes that succeeded, for the curriculum ``after_success="staged"``.
 
-    The share is a mean over all episodes, in which the weight of an episode falls by a factor of e with each
-    :attr:`EPISODES` later episodes. The share begins at 0.
+    The share is a mean over all episodes, in which the weight of an episode falls by a factor of e with each 1000 later
+    episodes. The share begins at 0. With ``collector=processes`` or ``ray``, every worker counts its own episodes, and
+    begins again when the run is resumed.
 
     Attributes:
         share: The share.
@@ -106,6 +108,7 @@ class SuccessShare:
     """
 
     EPISODES = 1000
+    """Number of episodes after which the weight of an episode has fallen by a factor of e."""
 
     def __init__(self) -> None:
         self.share = 0.0
