@@ -168,7 +168,8 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
         trainings: list[Training] = []
         try:
             for seed in SEEDS:
-                words = [*settings_of(task, method), f"seed={seed}", interval(settings), *settings]
+                words = [*settings_of(task, method), f"seed={seed}", *settings]
+                words.append(interval(words))
                 trainings.append(Training(words, root / name / f"trial-{trial.number:02}-seed{seed}"))
                 table.write(trial.number, seed, settings, scored(trainings[-1], seconds / 2))
             for step, used in ((1, seconds / 2), (2, seconds)):
@@ -189,8 +190,14 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
 
 
 def interval(words: Sequence[str]) -> str:
-    """Return the checkpoint interval in iterations for which all runs have the same number of steps per checkpoint."""
-    frames = next((int(word.partition("=")[2]) for word in words if "frames_per_batch" in word), 4096)
+    """Return the checkpoint interval in iterations for which all runs have the same number of steps per checkpoint.
+
+    Args:
+        words: All arguments of a run, because the defaults of a batch differ between tasks and methods.
+    """
+    from torchrl_mcp.runs.configuration import compose_run
+
+    frames = compose_run(*words).training.frames_per_batch
     return f"checkpoint_interval={max(1, STEPS_PER_CHECKPOINT // frames)}"
 
 
@@ -211,7 +218,8 @@ def compare(
             settings = arguments.split()
             if table.contains(name, seed, settings, seconds):
                 continue
-            words = [*settings_of(task, method), f"seed={seed}", interval(settings), *settings]
+            words = [*settings_of(task, method), f"seed={seed}", *settings]
+            words.append(interval(words))
             training = Training(words, root / f"{task}-{method}" / f"{name}-seed{seed}")
             try:
                 table.write(name, seed, settings, scored(training, seconds))

@@ -37,13 +37,13 @@ class Curriculum:
             ``"end"``: the success ends the episode, and is worth the reward for succeeding for ever.
             ``"continue"``: the episode continues, and every step in success earns its share of that reward, so that the
             character learns to leave the object at the target. ``"staged"``: successes end episodes until more than
-            half of the recent episodes have succeeded, see
-            :class:`~torchrl_mcp.envs.curriculum.SuccessShare`; from then on, episodes continue.
+            half of the recent episodes have succeeded; from then on, episodes continue. See
+            :class:`~torchrl_mcp.envs.curriculum.SuccessShare`.
         target_distance_power: Power of the distance to the target in a reward with ``reward_weights``.
         random_first_length: Whether to shorten the first episodes by different lengths, spread evenly over the
             simulations. Then simulations are at different times of their episodes; otherwise a batch of short
             trajectories would cover a single time.
-        discount: Discount factor of the learner. It determines what a success is worth that ends the episode.
+        discount: Discount factor of the learner, which determines the worth of a success that ends the episode.
 
     Raises:
         ValueError: If an argument is out of range.

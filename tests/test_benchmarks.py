@@ -229,6 +229,14 @@ def test_every_method_is_searched_over_settings_that_it_has(search):
             compose_run(*words, *search.batch_words(32, 1024, minibatches=8, passes=4), "stage.gamma=0.995")
 
 
+@pytest.mark.parametrize(
+    ("settings", "iterations"), [([], 4), (["training.num_envs=32", "training.frames_per_batch=1024"], 64)]
+)
+def test_checkpoints_are_as_many_steps_apart_whatever_the_batch_is(search, settings, iterations):
+    words = [*search.settings_of("dribble", "mcp"), "training.minibatch_size=512", *settings]
+    assert search.interval(words) == f"checkpoint_interval={iterations}"  # 65,536 steps in batches of 16,384 and 1,024
+
+
 def test_candidates_of_imitation_begin_from_the_start(search):
     cfg = compose_run(*search.settings_of("imitation", "mcp"))
     assert (cfg.stage.name, cfg.pretrained) == ("pretrain", None)
