@@ -167,6 +167,8 @@ def line(cell: Cell) -> dict[str, Any]:
     }
     if "success" in cell.metrics:
         facts["success"] = f"{cell.metrics['success']:.0%}"
+        if cell.success_return is not None:
+            facts["success pays 1"] = f"{cell.success_return:.3f}"
     if cell.place[0] == "imitation":
         facts["completed"] = f"{1 - average([numbers['terminated'] for numbers in chosen]):.0%}"
         facts["tracking error"] = f"{cell.metrics['tracking_error']:.3f} m"
@@ -247,6 +249,7 @@ def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
             **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
             "success": numbers["metrics"].get("success", EMPTY),
             "place": numbers.get("reach", {}).get("place", EMPTY),
+            "success_return": numbers.get("success_return", EMPTY),
             "episodes": numbers["episodes"],
             "seconds": round(run.seconds),
             "preset": run.preset,

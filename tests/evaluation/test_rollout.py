@@ -180,6 +180,16 @@ def test_the_duration_of_a_flag_is_counted_in_steps_of_the_episode():
     assert episode_statistics(outcome, lambda returns: returns)["durations"] == pytest.approx({"success": 5 / 3})
 
 
+def test_a_success_pays_one_except_in_the_step_that_ends_the_episode():
+    outcome = evaluate(IDLE, Lasting([1, 2, 5]))
+    assert outcome.returns.tolist() == [1, 4, 15]
+    # One step without success; then a truncated step with success; then three steps, and a terminated step that pays 3.
+    assert outcome.success_returns.tolist() == [1, 2 + 1, 3 + 3 * 1 + 3]
+    assert episode_statistics(outcome, lambda returns: returns / 5)["success_return"] == pytest.approx(13 / 15)
+    assert evaluate(IDLE, Countdown([1])).success_returns is None
+    assert "success_return" not in episode_statistics(episodes([1.0]), lambda returns: returns)
+
+
 def test_flags_count_once_raised_and_numbers_are_averaged_over_the_episode():
     outcome = evaluate(IDLE, Measured([1, 2, 5]))
     assert outcome.metrics["success"].tolist() == [False, True, True]

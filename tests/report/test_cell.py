@@ -54,6 +54,18 @@ def test_a_seed_that_is_stored_twice_counts_once(write_run):
     assert (len(two.by_seed), two.begun) == (2, 2)
 
 
+def test_the_return_in_which_a_success_pays_is_a_mean_over_seeds_unless_a_run_lacks_it(write_run):
+    folders = [write_run(name, seed=seed, score=0.5) for seed, name in enumerate("ab")]
+    assert grouped(*folders)[0].success_return is None
+    for folder, score in zip(folders, (0.4, 0.8), strict=True):
+        path = folder / "evaluation.json"
+        content = json.loads(path.read_text())
+        content["deterministic"]["success_return"] = score
+        path.write_text(json.dumps(content))
+    assert grouped(*folders)[0].success_return == pytest.approx(0.6)
+    assert grouped(*folders, write_run("c", seed=2, score=0.5))[0].success_return is None
+
+
 def test_a_seed_that_occurs_twice_and_different_evaluations_are_remarked(write_run):
     (cell,) = grouped(write_run("a", score=0.5), write_run("b", score=0.5, episodes=32))
     assert cell.remarks == [

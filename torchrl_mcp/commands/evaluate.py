@@ -65,6 +65,8 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
                 f"    {round(100 * reach['place'])}% of the way from standing still ({reach['standing']:.3f}) "
                 f"to an ideal player ({reach['ideal']:.3f})"
             )
+        if "success_return" in numbers:
+            print(f"    normalised return {numbers['success_return']:.3f} with the reward 1 while successful")
         if diagnostics := numbers["diagnostics"]:
             print(text_table([{"diagnostic": name, "value": value} for name, value in diagnostics.items()]))
         if numbers["diagnostics"].get("options/effective_options", math.inf) < COLLAPSED:

@@ -15,6 +15,9 @@ from torchrl_mcp.adapters.contract import Reach, task_reward
 from torchrl_mcp.evaluation.bars import bar
 from torchrl_mcp.evaluation.statistics import mean
 
+SUCCESS = "success"
+"""Name of the metric for a step in which the task is solved."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -27,6 +30,9 @@ class Evaluation:
         metrics: Other measurements of the task by name, ``(N,)``. For a flag such as ``success``, the value is whether
             the flag was ever raised in the episode; for a number such as ``tracking_error``, the mean over the steps.
         durations: Number of control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
+        success_returns: Returns with the reward 1 in every step with a success that is not the end of the episode,
+            ``(N,)``, or None if the task has no metric ``success``. In carry and dribble, the returns of the same
+            episodes with ``success_reward``.
         decisions: Recorded outputs of the policy for all steps of all episodes, batch size ``(M,)``.
         reach: Returns of standing still and of an ideal player in the same episodes, or None if the task does not
             compute them.
@@ -39,6 +45,7 @@ class Evaluation:
     terminated: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
     durations: dict[str, Tensor] = field(default_factory=dict)
+    success_returns: Tensor | None = None
     decisions: TensorDictBase = field(default_factory=TensorDict)
     reach: Reach | None = None
     positions: Tensor | None = None
@@ -86,6 +93,7 @@ def evaluate(
         kind = flags if env.observation_spec[key].dtype is torch.bool else sums
         kind[key] = torch.zeros_like(state[key])
     raised_steps = {key: torch.zeros_like(flag, dtype=torch.int64) for key, flag in flags.items()}
+    lacking = {key: torch.zeros_like(flag, dtype=returns.dtype) for key, flag in flags.items()}
     steps = getattr(env, "max_episode_steps", None)
     with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
         while running.any() and lengths.max() < max_steps:
@@ -94,12 +102,16 @@ def evaluate(
             decisions.append(decision.select(*record)[running.to(device)])
             step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))
             outcome = step["next"]
-            returns += task_reward(outcome).squeeze(-1) * running
+            reward = task_reward(outcome)
+            returns += reward.squeeze(-1) * running
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
             for key, raised in flags.items():
-                raised |= running.unsqueeze(-1) & outcome[key]
-                raised_steps[key] += running.unsqueeze(-1) & outcome[key]
+                raised_now = running.unsqueeze(-1) & outcome[key]
+                raised |= raised_now
+                raised_steps[key] += raised_now
+                # what the reward of these steps lacks to 1; a fall earns nothing
+                lacking[key] += (1 - reward) * (raised_now & ~outcome["terminated"])
             for key, total in sums.items():
                 total += outcome[key] * running.unsqueeze(-1)
             running &= ~outcome["done"].squeeze(-1)
@@ -108,8 +120,18 @@ def evaluate(
     means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
     metrics = _by_name(flags | means, names)
     durations = _by_name(raised_steps, names)
-    measured = torch.stack(path) if path else None
-    return Evaluation(returns, lengths, terminated, metrics, durations, torch.cat(decisions), reach, measured)
+    success_returns = returns + _by_name(lacking, names)[SUCCESS] if SUCCESS in durations else None
+    return Evaluation(
+        returns=returns,
+        lengths=lengths,
+        terminated=terminated,
+        metrics=metrics,
+        durations=durations,
+        success_returns=success_returns,
+        decisions=torch.cat(decisions),
+        reach=reach,
+        positions=torch.stack(path) if path else None,
+    )
 
 
 def _by_name(values: dict[str, Tensor], names: dict[str, list[str]]) -> dict[str, Tensor]:
@@ -134,6 +156,8 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
         deviation over episodes, and ``interval`` the 95 % percentile bootstrap interval of the mean of the normalised
         return; both are 0 wide for a single episode. ``reach``, which some tasks have, contains the returns of
         ``standing`` and of an ``ideal`` player, and ``place``, which is 0 at the former and 1 at the latter.
+        ``success_return``, which tasks with a metric ``success`` have, is the normalised return with the reward 1 in
+        every step with a success.
         ``episodes`` is the number of episodes.
     """
     normalised = normalised_return(outcome.returns)
@@ -143,11 +167,15 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
     if outcome.reach is not None:
         ends = {name: normalised_return(returns).mean().item() for name, returns in outcome.reach._asdict().items()}
         reach = {"reach": {"place": outcome.reach.place(outcome.returns).item(), **ends}}
+    success_return = {}
+    if outcome.success_returns is not None:
+        success_return = {"success_return": normalised_return(outcome.success_returns).mean().item()}
     return {
         "normalised_return": normalised.mean().item(),
         "normalised_return_std": 0.0 if single else normalised.std().item(),
         "interval": [estimate.value] * 2 if single else [estimate.low, estimate.high],
         **reach,
+        **success_return,
         "return": outcome.returns.mean().item(),
         "length": outcome.lengths.float().mean().item(),
         "terminated": outcome.terminated.float().mean().item(),

@@ -162,6 +162,12 @@ class Cell:
         return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
 
     @property
+    def success_return(self) -> float | None:
+        """Mean over seeds of the deterministic return with the reward 1 while successful; None if a run lacks it."""
+        returns = [run.evaluation["deterministic"].get("success_return") for run in self.complete]
+        return None if not returns or None in returns else fmean(returns)
+
+    @property
     def remarks(self) -> list[str]:
         """Remarks on the reliability of the numbers."""
         incomplete = grouped((run for run in self.runs if run.state != "complete"), _standing)

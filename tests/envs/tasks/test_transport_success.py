@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 
 from torchrl_mcp.envs import Carry, Dribble
+from torchrl_mcp.evaluation.rollout import evaluate
 
 every_task = pytest.mark.parametrize("task", [Carry, Dribble])
 
@@ -73,6 +75,21 @@ def test_success_has_a_limit_and_may_be_worth_one(task, success_reward):
     outcome = env.step(carrier.set("action", torch.zeros(2, 17)))["next"]
     assert outcome["success"].flatten().tolist() == [True, False]
     assert (outcome["reward"] == 1).flatten().tolist() == [success_reward, False]
+
+
+@every_task
+def test_an_evaluation_computes_the_return_with_a_success_reward(task):
+    falling = TensorDictModule(lambda goal: torch.ones(2, 17), ["goal"], ["action"])
+    outcomes = []
+    for success_reward in (False, True):
+        env = make(task, num_envs=2, success_reward=success_reward, max_episode_steps=60, object_distances=(1.0, 1.0))
+        outcomes.append(evaluate(falling, env, start=near_success(env)))
+    printed, paid = outcomes
+    assert printed.terminated.any()
+    assert printed.durations["success"][0] > 5
+    assert not torch.allclose(printed.returns, paid.returns)
+    torch.testing.assert_close(printed.success_returns, paid.returns)
+    torch.testing.assert_close(paid.success_returns, paid.returns)
 
 
 @every_task
