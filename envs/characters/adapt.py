@@ -27,9 +27,9 @@ from torchrl_mcp.envs.characters.drives import (
     matched,
     passive_drive,
 )
+from torchrl_mcp.envs.characters.mirror import Sides, guessed_sides
 from torchrl_mcp.envs.characters.omissions import omissions
 from torchrl_mcp.envs.characters.pose import FREE_RANGE, Pose
-from torchrl_mcp.envs.characters.sides import Sides, guessed_sides
 
 BEYOND = 1.2
 """Factor on the limits of a joint that defines the range of its targets."""

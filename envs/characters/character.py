@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 
 from torchrl_mcp.envs.characters.contract import Violation, violations
-from torchrl_mcp.envs.characters.sides import SIDES, Sides
+from torchrl_mcp.envs.characters.mirror import SIDES, Sides
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from torchrl_mcp.envs.characters.mirror import APART, without_mirror_image, without_twin
-from torchrl_mcp.envs.characters.sides import SIDES, Sides, twin
+from torchrl_mcp.envs.characters.mirror import APART, SIDES, Sides, twin, without_mirror_image, without_twin
 from torchrl_mcp.envs.characters.stance import collapse
 
 SOLE = 0.005

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mcp.envs.characters import CHARACTERS
-from torchrl_mcp.envs.characters.mirror import REFLECTION
-from torchrl_mcp.envs.characters.sides import Sides, twin
+from torchrl_mcp.envs.characters.mirror import REFLECTION, Sides, twin
 
 
 @cache

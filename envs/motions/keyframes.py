@@ -1,10 +1,11 @@
-"""Splines through the keyframes of a cyclic motion."""
+"""Smooth curves: splines through the keyframes of a cyclic motion, and averages over time."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import conv1d, pad
 
 Keyframes = Sequence[tuple[float, float]]
 """Increasing phases of a cycle in [0, 1), with their values."""
@@ -48,3 +49,11 @@ def _located(keyframes: Keyframes, phase: Tensor) -> tuple[Tensor, Tensor, Tenso
     phase = knots[0] + (phase - knots[0]) % 1
     index = torch.searchsorted(knots, phase, right=True) - 1
     return values, index, (phase - knots[index]) / width[index]
+
+
+def smoothed(values: Tensor, fps: float, window: float) -> Tensor:
+    """Average over time, the last dimension, with a Hann window of ``window`` seconds; the ends are held."""
+    half = max(1, min(round(window * fps / 2), values.shape[-1] - 1))
+    weights = torch.hann_window(2 * half + 1, periodic=False, dtype=values.dtype)
+    padded = pad(values.reshape(-1, 1, values.shape[-1]), (half, half), mode="replicate")
+    return conv1d(padded, (weights / weights.sum()).view(1, 1, -1)).view_as(values)

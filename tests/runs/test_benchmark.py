@@ -128,7 +128,7 @@ def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     def steps(job):
         return job.config["training"]["total_frames"] + (steps(jobs[job.needs]) if job.needs else 0)
 
-    assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 5_500_000)
+    assert {job.config["method"]["name"]: steps(job) for job in transfers} == dict.fromkeys(METHODS, 6_000_000)
 
 
 def test_pretraining_ignores_how_much_the_gate_of_transfer_explores(tmp_path):

@@ -7,7 +7,7 @@ from refusals import refused
 from torchrl_mcp.runs.arguments import require_callable
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.runs.imports import require_environment
-from torchrl_mcp.runs.names import require_used
+from torchrl_mcp.runs.requirements import require_used
 
 METHODS = ("mcp", "moe", "scratch", "finetune", "hierarchical", "option_critic", "latent_space")
 

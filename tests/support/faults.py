@@ -159,6 +159,7 @@ FAULTS = {
     "torchrl_mcp/objectives/ppo.py": [
         ("mean.abs() - self.bound", "mean - self.bound", "objectives/test_ppo.py"),
         ("excess.square().sum(-1)", "excess.square().mean(-1)", "objectives/test_ppo.py"),
+        ("if target.shape != values.shape", "if False", "objectives/test_values.py"),
     ],
     "torchrl_mcp/objectives/advantages.py": [
         ("    cut[..., -1] = True\n", "", "objectives/test_advantages.py"),
@@ -186,7 +187,6 @@ FAULTS = {
         ('self.mirrors["action"](self._mean(image))', "self._mean(image)", "objectives/test_symmetry.py"),
         ("<= self.tolerance", ">= self.tolerance", "objectives/test_symmetry.py"),
     ],
-    "torchrl_mcp/objectives/values.py": [("if target.shape != values.shape", "if False", "objectives/test_values.py")],
     # Environments
     "envs/rotations.py": [
         ("2 * (x * y + w * z)", "2 * (x * y - w * z)", "envs/test_rotations.py"),
@@ -418,8 +418,8 @@ FAULTS = {
     "torchrl_mcp/training/metrics.py": [
         ('if int(row["iteration"]) <= iteration', 'if int(row["iteration"]) < iteration', "training/test_metrics.py"),
         ("if kept else 0) < iteration", "if kept else 0) < 0", "training/test_metrics.py"),
+        ("            self.returns[done] = 0\n", "", "training/test_episodes.py"),
     ],
-    "torchrl_mcp/training/episodes.py": [("            self.returns[done] = 0\n", "", "training/test_episodes.py")],
     "torchrl_mcp/training/transfer.py": [
         (
             "[..., before + entry.start : before + entry.stop]",
@@ -440,8 +440,8 @@ FAULTS = {
             "training/test_collectors.py::test_environments_that_do_not_divide_evenly_are_refused",
         ),
     ],
-    "torchrl_mcp/training/dead_units.py": [
-        ("(output <= 0).all(0)", "(output <= 0).any(0)", "training/test_dead_units.py")
+    "torchrl_mcp/evaluation/diagnostics.py": [
+        ("(output <= 0).all(0)", "(output <= 0).any(0)", "evaluation/test_dead_units.py")
     ],
     "torchrl_mcp/training/precision.py": [
         ('if autocast != "auto" and not isinstance(autocast, bool)', "if False", "training/test_precision.py")
@@ -455,9 +455,14 @@ FAULTS = {
     ],
     "torchrl_mcp/evaluation/rollout.py": [
         (
-            "task_reward(outcome).squeeze(-1) * running",
-            "task_reward(outcome).squeeze(-1)",
+            "reward.squeeze(-1) * running",
+            "reward.squeeze(-1)",
             "evaluation/test_rollout.py",
+        ),
+        (
+            '(raised_now & ~outcome["terminated"])',
+            "raised_now",
+            "evaluation/test_rollout.py envs/tasks/test_transport_success.py",
         ),
         (
             'terminated |= running & outcome["terminated"]',
@@ -583,10 +588,6 @@ FAULTS = {
         ('("pretrain", "transfer", "evaluation"), environment', '("pretrain", "transfer"), environment', INHERITED),
         ("if wrong := list(wrong_values(given, types)):", "if wrong := []:", GIVEN),
     ],
-    "torchrl_mcp/runs/names.py": [
-        ("if lines := [f", "if False and [f", KEY),
-        ('if name not in ("defaults", "hydra", *cfg)]', "if False]", KEY),
-    ],
     "torchrl_mcp/runs/arguments.py": [
         ("for called in reversed(_called(name)):", "for called in _called(name)[:1]:", INHERITED),
         (
@@ -600,6 +601,8 @@ FAULTS = {
         ("    require_trusted(config, source)\n", "", "runs/test_trust.py"),
     ],
     "torchrl_mcp/runs/requirements.py": [
+        ("if lines := [f", "if False and [f", KEY),
+        ('if name not in ("defaults", "hydra", *cfg)]', "if False]", KEY),
         ('if kind_of_device == "cuda" and not', "if False and not", "runs/test_remedies.py"),
         ('if kind_of_device == "mps"', "if False", "runs/test_remedies.py"),
         ('if kind != "csv" and find_spec(kind) is None', "if False", "runs/test_remedies.py"),

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mcp.training.episodes import EpisodeStatistics
+from torchrl_mcp.training.metrics import EpisodeStatistics
 
 
 def batch(reward, done):

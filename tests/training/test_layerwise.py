@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchrl_mcp.training.dead_units import DeadUnits
+from torchrl_mcp.evaluation.diagnostics import DeadUnits
 from torchrl_mcp.training.layerwise import layerwise_adam
 
 

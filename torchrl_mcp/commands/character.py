@@ -156,7 +156,7 @@ def check(arguments: argparse.Namespace) -> int:
     """Print each violation of the contract; return the exit status."""
     from torchrl_mcp.envs.characters.contract import guessed_feet, passive_bodies, violations
     from torchrl_mcp.envs.characters.files import read_body
-    from torchrl_mcp.envs.characters.sides import SIDES, guessed_sides
+    from torchrl_mcp.envs.characters.mirror import SIDES, guessed_sides
 
     spec = read_body(arguments.file)
     model = spec.compile()

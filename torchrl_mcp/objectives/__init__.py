@@ -3,14 +3,12 @@
 An estimator takes trajectories ``(N, T)`` and adds its estimates. A loss takes samples ``(B,)`` and returns scalars.
 """
 
-from torchrl_mcp.objectives.actor_loss import ActorLoss
 from torchrl_mcp.objectives.advantages import Advantages
 from torchrl_mcp.objectives.latent import LatentPPOLoss
 from torchrl_mcp.objectives.option_critic import OptionAdvantages, OptionCriticLoss, OptionValueLoss
-from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
+from torchrl_mcp.objectives.ppo import ActorLoss, BoundedClipPPOLoss, ValueLoss
 from torchrl_mcp.objectives.semi_markov import SemiMarkovAdvantages
 from torchrl_mcp.objectives.symmetry import MirroredSamples, SymmetryLoss
-from torchrl_mcp.objectives.values import ValueLoss
 
 __all__ = [
     "ActorLoss",

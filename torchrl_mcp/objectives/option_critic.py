@@ -16,8 +16,7 @@ from torch.distributions import Distribution
 
 from torchrl_mcp.methods.options import EpsilonGreedy, of_option
 from torchrl_mcp.objectives.advantages import ScaledGAE, normalised, upon_arrival
-from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss
-from torchrl_mcp.objectives.values import ValueLoss
+from torchrl_mcp.objectives.ppo import BoundedClipPPOLoss, ValueLoss
 from torchrl_mcp.values import Discount, NotNegative, Positive, Share
 
 

@@ -1,15 +1,69 @@
-"""PPO's loss with a penalty on out-of-bounds actions."""
+"""The losses of PPO for actor and critic, and what the training loop requires of the loss of an actor."""
 
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams, dispatch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_mcp.values import NotNegative, Positive
+
+REPORTS = ("kl_approx", "mean_ratio")
+"""Outputs from which the loop estimates the KL divergence of an update, as TorchRL's PPO losses name them."""
+
+
+class ActorLoss(nn.Module):
+    r"""Base class for a loss of an actor that is not a subclass of TorchRL's ``ClipPPOLoss``.
+
+    The forward pass takes samples ``(B,)`` and returns scalars: the terms to minimise, whose names begin with
+    ``loss_``, and reports. Let :math:`r` be the probability of a sample under the present policy divided by its
+    probability under the policy that collected it. Two reports are required:
+
+    - ``mean_ratio`` is :math:`E[r]`.
+    - ``kl_approx`` is :math:`-E[\log r]`, in nats.
+
+    Attributes:
+        out_keys: Names of all outputs.
+
+    Example:
+        The policy gradient without clipping:
+
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mcp.objectives import ActorLoss
+        >>> class PolicyGradient(ActorLoss):
+        ...     out_keys = ["loss_objective", "mean_ratio", "kl_approx"]
+        ...
+        ...     def __init__(self, actor):
+        ...         super().__init__()
+        ...         self.actor = actor
+        ...
+        ...     def forward(self, samples):
+        ...         log_prob = self.actor.trained.get_dist(samples).log_prob(samples["action"])
+        ...         log_ratio = log_prob - samples["action_log_prob"]
+        ...         return TensorDict(
+        ...             loss_objective=-(log_prob * samples["advantage"].squeeze(-1)).mean(),
+        ...             mean_ratio=log_ratio.exp().mean(),
+        ...             kl_approx=-log_ratio.mean(),
+        ...         )
+    """
+
+    out_keys: list[str]
+
+
+def require_reports(loss: nn.Module) -> None:
+    """Check that a loss declares the outputs that the loop reads.
+
+    Raises:
+        ValueError: If the loss does not declare them.
+    """
+    if missing := [name for name in REPORTS if name not in getattr(loss, "out_keys", ())]:
+        raise ValueError(
+            f"{type(loss).__name__} does not report {' and '.join(missing)}: return these values with the loss, name "
+            "them in its out_keys, and derive the loss from torchrl_mcp.objectives.ActorLoss"
+        )
 
 
 class BoundedClipPPOLoss(ClipPPOLoss):
@@ -89,3 +143,51 @@ class BoundedClipPPOLoss(ClipPPOLoss):
     def _reduced(self, errors: Tensor, samples: TensorDictBase) -> Tensor:
         """Reduce errors ``(*B,)`` as TorchRL reduces its own: by ``reduction``, without padding."""
         return self._reduce_loss(errors.unsqueeze(-1), samples).squeeze(-1)
+
+
+class ValueLoss(nn.Module):
+    r"""Mean squared error of a value function against its targets.
+
+    .. math:: L = c \, \mathbb{E} \, (V(s, g) - y)^2
+
+    This is the ``loss_critic`` of TorchRL's PPO with ``loss_critic_type="l2"``. It has no terms of the actor, so that
+    actor and critic can learn at the same time.
+
+    Args:
+        critic_network: From ``observation`` and ``goal`` to ``state_value``, ``(B, 1)``.
+        coeff: Weight of the error, :math:`c`.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl_mcp.objectives import ValueLoss
+        >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
+        >>> samples = TensorDict({"observation": torch.randn(16, 3), "value_target": torch.zeros(16, 1)}, [16])
+        >>> sorted(ValueLoss(critic, coeff=1.0)(samples).keys())
+        ['explained_variance', 'loss_critic']
+    """
+
+    def __init__(self, critic_network: TensorDictModuleBase, *, coeff: NotNegative) -> None:
+        super().__init__()
+        self.critic_network = critic_network
+        self.coeff = coeff
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_critic`` of samples ``(B,)``, and the ``explained_variance`` of the targets as a share.
+
+        Raises:
+            ValueError: If ``value_target`` has another shape than the values, ``(B, 1)``.
+        """
+        target = tensordict["value_target"]
+        values = self._values(tensordict)
+        if target.shape != values.shape:
+            shapes = f"shape {tuple(target.shape)}, but values have {tuple(values.shape)}"
+            raise ValueError(f"value_target has {shapes}: give both the same shape, for example by unsqueeze(-1)")
+        residual = target - values
+        with torch.no_grad():
+            explained = 1 - residual.var(correction=0) / target.var(correction=0).clamp_min(1e-8)
+        return TensorDict({"loss_critic": self.coeff * residual.square().mean(), "explained_variance": explained})
+
+    def _values(self, samples: TensorDictBase) -> Tensor:
+        return self.critic_network(samples.select(*self.critic_network.in_keys))["state_value"]

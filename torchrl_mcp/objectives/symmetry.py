@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.objectives.actor_loss import ActorLoss
+from torchrl_mcp.objectives.ppo import ActorLoss
 from torchrl_mcp.values import NotNegative, Positive
 
 

@@ -12,8 +12,7 @@ from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.training.checkpoint import RunRandomness, load, rotation, run_checkpoint, save
 from torchrl_mcp.training.collectors import Batches, TrajectorySource
-from torchrl_mcp.training.episodes import EpisodeStatistics
-from torchrl_mcp.training.metrics import MetricsWriter
+from torchrl_mcp.training.metrics import EpisodeStatistics, MetricsWriter
 from torchrl_mcp.training.progress import Progress, Stopwatch, TrainingBar
 from torchrl_mcp.training.run_folder import NORMALISED_RETURN
 from torchrl_mcp.training.update import Agent, Objective, PPOSettings, Update

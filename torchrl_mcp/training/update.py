@@ -14,9 +14,9 @@ from torch.distributions import Categorical, Distribution
 from torch.optim import Optimizer
 from torchrl.objectives import KLAdaptiveLR
 
+from torchrl_mcp.evaluation.diagnostics import DeadUnits
 from torchrl_mcp.methods.actor import Actor
-from torchrl_mcp.objectives.actor_loss import require_reports
-from torchrl_mcp.training.dead_units import DeadUnits
+from torchrl_mcp.objectives.ppo import require_reports
 from torchrl_mcp.training.threads import side_by_side
 from torchrl_mcp.training.transfer import FrozenParts
 from torchrl_mcp.values import Count, Positive, Whole

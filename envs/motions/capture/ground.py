@@ -12,7 +12,7 @@ from torch.nn.functional import max_pool1d
 from torchrl_mcp.envs.characters.kinematics import body_states
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import support
-from torchrl_mcp.envs.motions.smoothing import smoothed
+from torchrl_mcp.envs.motions.keyframes import smoothed
 from torchrl_mcp.envs.motions.soles import Soles, soles
 
 FPS = 60.0

@@ -8,7 +8,7 @@ import yaml  # type: ignore[import-untyped]
 
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model
-from torchrl_mcp.envs.characters.sides import Sides
+from torchrl_mcp.envs.characters.mirror import Sides
 from torchrl_mcp.envs.motions.capture.anatomy import ARM, HEAD_AND_ARMS, LEG, LEGS, NAMES, SIDES, TRUNK, limb
 
 PARTS = (*TRUNK, *LEGS, *HEAD_AND_ARMS)

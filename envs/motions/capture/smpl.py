@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchrl_mcp.envs.characters.sides import twin
+from torchrl_mcp.envs.characters.mirror import twin
 from torchrl_mcp.envs.motions.archive import Archive
 from torchrl_mcp.envs.motions.capture.skeleton import AXES, SourceMotion, frame_rate
 from torchrl_mcp.envs.rotations import from_rotation_vector

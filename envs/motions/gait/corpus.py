@@ -6,8 +6,7 @@ from torch import Tensor
 
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.gait.generator import FPS, stride, walk
-from torchrl_mcp.envs.motions.keyframes import minimum_jerk
-from torchrl_mcp.envs.motions.smoothing import smoothed
+from torchrl_mcp.envs.motions.keyframes import minimum_jerk, smoothed
 
 WALKS = 7
 DURATION = 16.4

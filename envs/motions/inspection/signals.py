@@ -9,7 +9,7 @@ from torchrl_mcp.envs.characters.joints import character_model
 from torchrl_mcp.envs.characters.kinematics import BodyStates, body_names
 from torchrl_mcp.envs.motions.clip import MotionClip
 from torchrl_mcp.envs.motions.contacts import contact_points
-from torchrl_mcp.envs.motions.smoothing import smoothed
+from torchrl_mcp.envs.motions.keyframes import smoothed
 from torchrl_mcp.envs.rotations import heading, rotate
 
 

@@ -15,7 +15,7 @@ from torchrl_mcp.envs.characters.adapt import BEYOND, adapted, key_bodies
 from torchrl_mcp.envs.characters.contract import lowest_bodies, violations
 from torchrl_mcp.envs.characters.drives import LIMIT_ANGLE
 from torchrl_mcp.envs.characters.files import float_trunk
-from torchrl_mcp.envs.characters.sides import guessed_sides, twin
+from torchrl_mcp.envs.characters.mirror import guessed_sides, twin
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 ROBOT = """

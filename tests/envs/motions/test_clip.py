@@ -9,7 +9,7 @@ import torch
 from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.envs.characters.joints import character_model, joint_layout
 from torchrl_mcp.envs.characters.kinematics import body_names, body_states
-from torchrl_mcp.envs.characters.sides import twin
+from torchrl_mcp.envs.characters.mirror import twin
 from torchrl_mcp.envs.motions.clip import MotionClip, concatenated, differences
 from torchrl_mcp.envs.motions.errors import MotionFormatError
 from torchrl_mcp.envs.motions.gait.generator import stride

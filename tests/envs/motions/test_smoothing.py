@@ -2,7 +2,7 @@ import math
 
 import torch
 
-from torchrl_mcp.envs.motions.smoothing import smoothed
+from torchrl_mcp.envs.motions.keyframes import smoothed
 
 
 def test_a_hann_window_of_two_periods_removes_a_wave_and_keeps_a_constant():

@@ -7,9 +7,9 @@ import torch
 from smoke import SMOKE
 from torch import nn
 
+from torchrl_mcp.evaluation.diagnostics import DeadUnits
 from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.training.dead_units import DeadUnits
 
 METHODS = ("mcp", "moe", "latent_space", "finetune", "hierarchical", "option_critic", "scratch")
 
