@@ -39,6 +39,8 @@ class Curriculum:
             character learns to leave the object at the target. ``"staged"``: successes end episodes until more than
             half of the recent episodes have succeeded; from then on, episodes continue. See
             :class:`~torchrl_mcp.envs.curriculum.SuccessShare`.
+        success_worth: Worth of a step in success with ``reward_weights``, as a multiple of the best reward that a step
+            without success can have.
         target_distance_power: Power of the distance to the target in a reward with ``reward_weights``.
         random_first_length: Whether to shorten the first episodes by different lengths, spread evenly over the
             simulations. Then simulations are at different times of their episodes; otherwise a batch of short
@@ -63,6 +65,7 @@ class Curriculum:
     mixture: Sequence[Alternative] = ()
     reward_weights: Weights | None = None
     after_success: Literal["end", "continue", "staged"] = "end"
+    success_worth: Positive = 1
     target_distance_power: NotNegative = 1
     random_first_length: bool = False
     discount: Share = 0.99

@@ -197,10 +197,15 @@ class Transport(PDCharacterEnv):
             speed=self.speed,
             target_distance_power=self.curriculum.target_distance_power,
         )
-        discount = self.curriculum.discount
-        success = self.success()
-        ends = self.ends_at_success
-        return training_reward(reward, success, weights=weights, speed=self.speed, discount=discount, ends=ends)
+        return training_reward(
+            reward,
+            self.success(),
+            weights=weights,
+            speed=self.speed,
+            discount=self.curriculum.discount,
+            worth=self.curriculum.success_worth,
+            ends=self.ends_at_success,
+        )
 
     def terminated(self) -> Tensor:
         """A success, if it ends the episode."""

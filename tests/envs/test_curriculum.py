@@ -81,15 +81,16 @@ def stand(env, state):
     return taken["next"], state
 
 
-def test_if_episodes_continue_every_step_in_success_earns_the_full_reward():
-    env = make(Dribble, curriculum={**WEIGHED, "after_success": "continue"}, **AT_THE_TARGET)
+@pytest.mark.parametrize("worth", [1, 2.5])
+def test_if_episodes_continue_every_step_in_success_earns_its_worth_of_the_full_reward(worth):
+    env = make(Dribble, curriculum={**WEIGHED, "after_success": "continue", "success_worth": worth}, **AT_THE_TARGET)
     full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
     state = env.reset()
     for _ in range(3):
         outcome, state = stand(env, state)
         assert outcome["success"].all()
         assert not outcome["terminated"].any()
-        torch.testing.assert_close(outcome["reward"], torch.full((4, 1), full))
+        torch.testing.assert_close(outcome["reward"], torch.full((4, 1), worth * full))
 
 
 @pytest.fixture
@@ -203,6 +204,7 @@ def test_standing_still_far_from_everything_earns_nothing():
         (Heading, {"reward_weights": [1.0] * 4}, "reward_weights=[1.0, 1.0, 1.0, 1.0]"),  # of none
         (Dribble, {"reward_weights": WEIGHTS, "discount": 1}, "discount=1"),
         (Dribble, {"reward_weights": WEIGHTS, "after_success": "stop"}, "after_success"),
+        (Dribble, {"reward_weights": WEIGHTS, "success_worth": 0}, "success_worth"),
         (Heading, {"discount": 0}, "discount=0"),
         (Heading, {"discount": 1.1}, "discount=1.1"),
         (Heading, {"emphasis": None}, "'emphasis'"),

@@ -274,8 +274,9 @@ FAULTS = {
             "target_distance_power",
             "envs/tasks/test_rewards.py envs/tasks/test_transport.py",
         ),
-        ("best / (1 - discount)", "best / discount", "envs/test_curriculum.py"),
-        (" if ends else best", "", "envs/test_curriculum.py"),
+        ("of_success / (1 - discount)", "of_success / discount", "envs/test_curriculum.py"),
+        ("worth * (sum(weights) - idle)", "sum(weights) - idle", "envs/test_curriculum.py"),
+        (" if ends else of_success", "", "envs/test_curriculum.py"),
     ],
     "envs/tasks/heading.py": [
         (
