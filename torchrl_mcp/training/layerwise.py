@@ -1,4 +1,7 @@
-"""Adam with smaller steps in layers with many inputs, whose units would otherwise die (:mod:`.dead_units`)."""
+"""Adam with smaller steps in layers with many inputs, whose units would otherwise die.
+
+:class:`~torchrl_mcp.evaluation.diagnostics.DeadUnits` counts such units.
+"""
 
 from collections.abc import Iterable
 from typing import Any
