@@ -461,8 +461,8 @@ FAULTS = {
             "evaluation/test_rollout.py",
         ),
         (
-            '(raised_now & ~outcome["terminated"])',
-            "raised_now",
+            '(flag & ~outcome["terminated"])',
+            "flag",
             "evaluation/test_rollout.py envs/tasks/test_transport_success.py",
         ),
         (

@@ -19,6 +19,9 @@ DIAGNOSED = ("gates", "option", "begins")
 COLLAPSED = 1.1
 """Options count as collapsed into one if their effective number is at most this."""
 
+MIN_SAMPLES = 64
+"""Least number of samples from which units are judged. An option that rarely acts may see fewer."""
+
 
 def diagnosed(actor: Actor) -> list[str]:
     """Return the keys of an actor's output that :func:`diagnostics` reads."""
@@ -45,10 +48,6 @@ def diagnostics(actor: Actor, samples: TensorDictBase) -> dict[str, float]:
     if not numbers:
         return {}
     return dict(zip(numbers, torch.stack(list(numbers.values())).tolist(), strict=True))  # one transfer from a GPU
-
-
-MIN_SAMPLES = 64
-"""Least number of samples from which units are judged. An option that rarely acts may see fewer."""
 
 
 class DeadUnits:

@@ -30,9 +30,9 @@ class Evaluation:
         metrics: Other measurements of the task by name, ``(N,)``. For a flag such as ``success``, the value is whether
             the flag was ever raised in the episode; for a number such as ``tracking_error``, the mean over the steps.
         durations: Number of control steps of each episode in which a flag among the metrics was raised, ``(N,)``.
-        success_returns: Returns with the reward 1 in every step with a success that is not the end of the episode,
-            ``(N,)``, or None if the task has no metric ``success``. In carry and dribble, the returns of the same
-            episodes with ``success_reward``.
+        success_returns: Returns with the reward 1 in every step with a success, except in a step that terminates the
+            episode, ``(N,)``; None if the task has no metric ``success``. In carry and dribble, these are the returns
+            that the same episodes have with ``success_reward``.
         decisions: Recorded outputs of the policy for all steps of all episodes, batch size ``(M,)``.
         reach: Returns of standing still and of an ideal player in the same episodes, or None if the task does not
             compute them.
@@ -93,7 +93,7 @@ def evaluate(
         kind = flags if env.observation_spec[key].dtype is torch.bool else sums
         kind[key] = torch.zeros_like(state[key])
     raised_steps = {key: torch.zeros_like(flag, dtype=torch.int64) for key, flag in flags.items()}
-    lacking = {key: torch.zeros_like(flag, dtype=returns.dtype) for key, flag in flags.items()}
+    shortfalls = {key: torch.zeros_like(flag, dtype=returns.dtype) for key, flag in flags.items()}
     steps = getattr(env, "max_episode_steps", None)
     with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
         while running.any() and lengths.max() < max_steps:
@@ -107,11 +107,10 @@ def evaluate(
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
             for key, raised in flags.items():
-                raised_now = running.unsqueeze(-1) & outcome[key]
-                raised |= raised_now
-                raised_steps[key] += raised_now
-                # what the reward of these steps lacks to 1; a fall earns nothing
-                lacking[key] += (1 - reward) * (raised_now & ~outcome["terminated"])
+                flag = running.unsqueeze(-1) & outcome[key]
+                raised |= flag
+                raised_steps[key] += flag
+                shortfalls[key] += (1 - reward) * (flag & ~outcome["terminated"])  # a fall earns nothing
             for key, total in sums.items():
                 total += outcome[key] * running.unsqueeze(-1)
             running &= ~outcome["done"].squeeze(-1)
@@ -120,7 +119,7 @@ def evaluate(
     means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
     metrics = _by_name(flags | means, names)
     durations = _by_name(raised_steps, names)
-    success_returns = returns + _by_name(lacking, names)[SUCCESS] if SUCCESS in durations else None
+    success_returns = returns + _by_name(shortfalls, names)[SUCCESS] if SUCCESS in durations else None
     return Evaluation(
         returns=returns,
         lengths=lengths,

@@ -26,6 +26,21 @@ SHARED = {name: name for name in ("seed", "device", "physics", "num_threads")} |
 EVALUATED = SHARED | {"seed": "evaluation.seed", "num_envs": "evaluation.episodes"}
 """The same arguments for environments that evaluate, which simulate on the CPU."""
 
+CONF = Path(str(files("torchrl_mcp.conf")))
+"""Folder of the library's configuration files."""
+
+COMPARED = ("method", "task", "training", "step_size", "evaluation", "transfer")
+"""Groups whose settings are compared by name, because they are not arguments of a class."""
+
+HEADER = "# @package _global_"
+"""First line of configuration files whose settings are outside the group of the file."""
+
+PARTS = {"transport": "task"}
+"""Files of ``conf`` that other files include, and the group of their settings."""
+
+ALIKE = 0.8
+"""Similarity to a known name, from 0 to 1, above which an unknown name counts as misspelt."""
+
 
 def require_all(cfg: DictConfig) -> None:
     """Check everything that a new run needs, before its folder is created.
@@ -140,22 +155,6 @@ def require_equipment(cfg: DictConfig) -> None:
     kind = cfg.logger.logger_type if cfg.logger else "csv"
     if kind != "csv" and find_spec(kind) is None:
         raise ValueError(f"logger={kind} needs {kind}: pip install 'torchrl-mcp[{kind}]', or choose logger=tensorboard")
-
-
-CONF = Path(str(files("torchrl_mcp.conf")))
-"""Folder of the library's configuration files."""
-
-COMPARED = ("method", "task", "training", "step_size", "evaluation", "transfer")
-"""Groups whose settings are compared by name, because they are not arguments of a class."""
-
-HEADER = "# @package _global_"
-"""First line of configuration files whose settings are outside the group of the file."""
-
-PARTS = {"transport": "task"}
-"""Files of ``conf`` that other files include, and the group of their settings."""
-
-ALIKE = 0.8
-"""Similarity to a known name, from 0 to 1, above which an unknown name counts as misspelt."""
 
 
 def require_used(cfg: DictConfig) -> None:
