@@ -107,7 +107,7 @@ def tuned(task, method):
     return CONF / "tuned" / task / f"{method}.yaml"
 
 
-TUNED = sorted(path.relative_to(CONF / "tuned").with_suffix("").parts for path in (CONF / "tuned").rglob("*.yaml"))
+TUNED = sorted(path.relative_to(CONF / "tuned").with_suffix("").parts for path in (CONF / "tuned").glob("*/*.yaml"))
 
 
 DIFFERENT = {(method, tuned(task, method).read_text()): (task, method) for task, method in TUNED}
@@ -123,9 +123,12 @@ def place(task, method):
 def test_tuned_settings_are_of_a_task_and_a_method(task, method):
     assert task in TASKS
     assert method in METHODS
-    own, cfg = OmegaConf.load(tuned(task, method)), composed(*place(task, method))
-    assert own
-    assert cfg == OmegaConf.merge(cfg, own)
+    settings = OmegaConf.load(tuned(task, method))
+    shared = [OmegaConf.load(CONF / f"{name[1:]}.yaml") for name in settings.pop("defaults", [])]
+    settings = OmegaConf.merge(*shared, settings)
+    assert settings
+    cfg = composed(*place(task, method))
+    assert cfg == OmegaConf.merge(cfg, settings)
 
 
 @pytest.mark.parametrize(("task", "method"), DIFFERENT.values())
