@@ -222,6 +222,34 @@ def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_ag
         search.main([*words[:3], "1", *words[4:], "--root", str(tmp_path), "--results", str(tmp_path)])
 
 
+def test_checkpoints_are_evaluated_after_numbers_of_steps_and_only_once(command, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    budgets = importlib.import_module("budgets")
+    monkeypatch.setattr(budgets, "BUDGETS", (128, 250, 300, 5000))
+    for method in ("mcp", "latent_space"):
+        network = BENCHMARKS / "results" / "table2" / "networks" / f"{method}-biped-0.torchrl"
+        words = ["preset=smoke", "task=dribble", f"method={method}", "stage=transfer", f"pretrained={network}"]
+        settings = ["checkpoint_interval=1", "keep_checkpoints=9", "task.evaluation.max_episode_steps=9"]
+        assert command("train", *words, *settings, f"run_root={tmp_path}/runs").returncode == 0
+    output = tmp_path / "budgets.csv"
+    arguments = ["budgets.py", str(tmp_path / "runs"), "--episodes", "2", "--output", str(output)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    budgets.main()
+    first = output.read_text()
+    rows = list(csv.DictReader(first.splitlines()))
+    # of the checkpoints after 128, 256, 384 and 512 steps, the third has more than 5 % above 300
+    assert sorted({(row["method"], row["budget"], row["steps"]) for row in rows}) == [
+        (method, budget, steps)
+        for method in ("latent_space", "mcp")
+        for budget, steps in (("128", "128"), ("250", "256"))
+    ]
+    assert len(rows) == 8  # two modes
+    assert (tmp_path / "budgets.png").exists()
+    monkeypatch.setattr(budgets.policies, "evaluation", None)
+    budgets.main()
+    assert output.read_text() == first
+
+
 def test_every_method_is_searched_over_settings_that_it_has(search):
     for method, noises in search.NOISE.items():
         for settings in noises.values():

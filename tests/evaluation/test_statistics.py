@@ -7,7 +7,14 @@ from refusals import refused
 from scipy.stats import mannwhitneyu
 
 from torchrl_mcp.evaluation import statistics
-from torchrl_mcp.evaluation.statistics import Estimate, deviation, interquartile_mean, mean, probability_of_improvement
+from torchrl_mcp.evaluation.statistics import (
+    Estimate,
+    deviation,
+    difference,
+    interquartile_mean,
+    mean,
+    probability_of_improvement,
+)
 
 
 def test_the_mean_is_the_mean_and_the_deviation_that_of_a_sample():
@@ -26,6 +33,16 @@ def test_the_interval_of_many_values_is_that_of_the_normal_distribution():
     estimate = mean(list(values))
     assert estimate.low == pytest.approx(values.mean() - half_width, abs=0.005)
     assert estimate.high == pytest.approx(values.mean() + half_width, abs=0.005)
+
+
+def test_the_interval_of_a_difference_adds_the_variances_of_both_samples():
+    generator = np.random.default_rng(1)
+    first, second = generator.normal(2.0, 1.0, size=400), generator.normal(size=100)
+    estimate = difference(list(first), list(second))
+    assert estimate.value == pytest.approx(first.mean() - second.mean())
+    half_width = 1.96 * math.sqrt(first.var() / 400 + second.var() / 100)
+    assert estimate.high - estimate.value == pytest.approx(half_width, rel=0.05)
+    assert estimate.value - estimate.low == pytest.approx(half_width, rel=0.05)
 
 
 def test_a_single_value_has_neither_deviation_nor_interval():

@@ -39,6 +39,19 @@ def mean(values: Sequence[float]) -> Estimate:
     return _estimate([values], np.mean, len(values))
 
 
+def difference(first: Sequence[float], second: Sequence[float]) -> Estimate:
+    """Return the first mean minus the second, with the percentile bootstrap interval that resamples each sample.
+
+    Raises:
+        ValueError: If a sample has no value.
+    """
+
+    def minus(*samples: np.ndarray, axis: int) -> np.ndarray:
+        return np.asarray(samples[0].mean(axis) - samples[1].mean(axis))
+
+    return _estimate([first, second], minus, len(first) + len(second))
+
+
 def deviation(values: Sequence[float]) -> float:
     """Return the standard deviation of a sample, with the divisor ``n - 1``; NaN for a single value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan

@@ -1,0 +1,143 @@
+r"""Evaluates the checkpoints of runs, to show how the lead of one method over another depends on the number of steps.
+
+    torchrl-mcp-train benchmark=table2 preset=comparison autocast=false task=dribble character=biped \
+        method=mcp,latent_space seed=0,1,2,3,4,5,6,7 checkpoint_interval=62 keep_checkpoints=100 run_root=runs/budgets
+    python benchmarks/budgets.py runs/budgets
+
+For each transfer in the folder and each number of steps, the script evaluates the first checkpoint that has at least
+as many steps, with 128 deterministic and 128 exploring episodes. ``results/budgets.csv`` has a row per evaluation;
+checkpoints that already have a row are not evaluated again, so that the script can follow runs while they train. The
+picture ``results/budgets.png`` shows the share of successful episodes, averaged over seeds, with 95 % bootstrap
+intervals. The script also prints the difference between the two methods after each number of steps, with an interval
+that resamples seeds. Every seed has a pre-training of its own.
+"""
+
+import argparse
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from report import about, table, write
+
+from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure, save_figure
+from torchrl_mcp.evaluation import statistics
+from torchrl_mcp.report.results import Run, find_runs
+from torchrl_mcp.runs import policies
+from torchrl_mcp.training.run_folder import CHECKPOINTS, MODES
+
+RESULTS = Path(__file__).resolve().parent / "results" / "budgets.csv"
+
+BUDGETS = (1_000_000, 3_000_000, 10_000_000, 30_000_000)
+"""Numbers of steps after which a run is evaluated."""
+
+TOLERANCE = 0.05
+"""Largest excess of a checkpoint's steps over its budget, as a share of the budget."""
+
+SEED = 12345
+"""Seed of the evaluations, that of the table."""
+
+
+def evaluated(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) -> Iterator[dict[str, Any]]:
+    """Yield a row for every checkpoint to be evaluated that has no row yet."""
+    present = {(row["method"], int(row["seed"]), int(row["budget"])) for row in rows}
+    for run in runs:
+        for budget, checkpoint in chosen(run.path).items():
+            if (run.method, run.seed, budget) in present:
+                continue
+            evaluation = policies.evaluation(checkpoint, episodes=episodes, seed=SEED)
+            for mode in MODES:
+                numbers = evaluation[mode]
+                yield {
+                    "task": run.place[0],
+                    "character": run.place[1],
+                    "method": run.method,
+                    "seed": run.seed,
+                    "budget": budget,
+                    "steps": steps_of(checkpoint),
+                    "mode": mode,
+                    "success": numbers["metrics"]["success"],
+                    "place": numbers["reach"]["place"],
+                    **{key: numbers[key] for key in ("normalised_return", "success_return", "terminated", "episodes")},
+                    "run_commit": run.commit,
+                    **about(),
+                }
+
+
+def chosen(folder: Path) -> dict[int, Path]:
+    """Return the checkpoint of a run for each budget: the first one with enough steps and not with far too many."""
+    checkpoints = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
+    first = {budget: next((c for c in checkpoints if steps_of(c) >= budget), None) for budget in BUDGETS}
+    return {budget: c for budget, c in first.items() if c and steps_of(c) <= (1 + TOLERANCE) * budget}
+
+
+def steps_of(checkpoint: Path) -> int:
+    """Return the environment steps of a checkpoint, which its name contains."""
+    return int(checkpoint.stem.removeprefix("checkpoint-"))
+
+
+def successes(rows: Sequence[dict[str, Any]]) -> dict[str, dict[int, list[float]]]:
+    """Return the deterministic success rates of all seeds, by method and budget."""
+    rates: dict[str, dict[int, list[float]]] = {}
+    for row in rows:
+        if row["mode"] == "deterministic":
+            rates.setdefault(row["method"], {}).setdefault(int(row["budget"]), []).append(float(row["success"]))
+    return rates
+
+
+def differences(rates: dict[str, dict[int, list[float]]]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each budget that both methods reached: mean success rates and their difference.
+
+    Raises:
+        SystemExit: If there are not two methods.
+    """
+    if len(rates) != 2:
+        raise SystemExit(f"differences need runs of two methods, but there are runs of {', '.join(rates) or 'none'}")
+    (first, ones), (second, others) = rates.items()
+    for budget in sorted(ones.keys() & others.keys()):
+        ahead = statistics.difference(ones[budget], others[budget])
+        yield {
+            "steps": f"{budget:,}",
+            **{name: f"{statistics.mean(rates[name][budget]).value:.0%}" for name in (first, second)},
+            "seeds": f"{len(ones[budget])}, {len(others[budget])}",
+            "difference": f"{ahead.value:+.0%} [{ahead.low:+.0%}, {ahead.high:+.0%}]",
+        }
+
+
+def draw(rates: dict[str, dict[int, list[float]]]) -> Any:
+    """Return a figure of the success rates by steps, with the intervals of the means and a dot for every seed."""
+    figure = new_figure(5.2, 3.2)
+    axes = figure.add_subplot()
+    for colour, (method, by_budget) in zip(COLOURS, rates.items(), strict=False):
+        budgets = sorted(by_budget)
+        means = [statistics.mean(by_budget[budget]) for budget in budgets]
+        axes.plot(budgets, [mean.value for mean in means], color=colour, label=method)
+        axes.fill_between(budgets, [m.low for m in means], [m.high for m in means], color=colour, alpha=0.2, lw=0)
+        for budget in budgets:
+            axes.plot([budget] * len(by_budget[budget]), by_budget[budget], ".", color=colour, alpha=0.5)
+    axes.set(xscale="log", xlabel="steps of transfer", ylabel="share of successful episodes", ylim=(0, 1))
+    axes.legend(frameon=False, labelcolor=INK)
+    bare(axes)
+    return figure
+
+
+def main() -> None:
+    """Evaluate, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="?", help="run_root of the runs; default: draw the rows again")
+    parser.add_argument("--episodes", type=int, default=128, help="episodes per evaluation (default %(default)s)")
+    parser.add_argument("--output", type=Path, default=RESULTS, help=f"CSV file (default {RESULTS.name})")
+    arguments = parser.parse_args()
+    rows: list[dict[str, Any]] = list(csv.DictReader(arguments.output.open())) if arguments.output.exists() else []
+    if arguments.runs:
+        runs = [run for run in find_runs([arguments.runs])[0] if run.stage == "transfer"]
+        for row in evaluated(runs, list(rows), episodes=arguments.episodes):
+            rows.append(row)
+            write(arguments.output, rows)
+    rates = successes(rows)
+    print(table(list(differences(rates))))
+    save_figure(draw(rates), arguments.output.with_suffix(""))
+
+
+if __name__ == "__main__":
+    main()
