@@ -232,14 +232,20 @@ class Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows = list(csv.DictReader(path.open())) if path.exists() else []
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows in the file, to which other searches may also write."""
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="") as file:
+            return list(csv.DictReader(file))
 
     def write(self, trial: int | str, seed: int, settings: Sequence[str], numbers: dict[str, Any]) -> None:
         """Add a row, and write the file."""
         row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings)}
         row |= {"processor": processor(), "commit": about()["commit"]}
-        self.rows.append({name: str(value) for name, value in row.items()})
-        write(self.path, self.rows)
+        write(self.path, [*self.rows, row])
 
     def score(self, trial: int) -> float:
         """Return the mean score of a trial's seeds in its last evaluation."""

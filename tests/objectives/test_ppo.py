@@ -64,6 +64,11 @@ def test_every_term_but_the_penalty_is_torchrl_s(loc, entropy_bonus, functional)
         assert torch.equal(report[key], value), key
 
 
+def test_an_entropy_of_weight_0_is_not_computed():
+    loss, _ = make(BoundedClipPPOLoss, INSIDE, functional=False, bound_coeff=10.0, entropy_coeff=0.0)
+    assert set(loss(samples(INSIDE)).keys()).isdisjoint({"entropy", "loss_entropy"})
+
+
 @pytest.mark.parametrize(
     ("loc", "bound", "expected"),
     [

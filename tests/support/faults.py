@@ -484,6 +484,7 @@ FAULTS = {
     "torchrl_mcp/evaluation/statistics.py": [
         ("axis=axis), 0.25, axis=axis", "axis=axis), 0.1, axis=axis", "evaluation/test_statistics.py"),
         ("ddof=1", "ddof=0", "evaluation/test_statistics.py"),
+        ("samples[0].mean(axis) -", "samples[0].mean(axis) +", "evaluation/test_statistics.py"),
         ("CONFIDENCE = 0.95", "CONFIDENCE = 0.8", "evaluation/test_statistics.py"),
     ],
     "torchrl_mcp/evaluation/clips.py": [("if env.num_envs % count", "if False", "evaluation/test_clips.py")],

@@ -242,4 +242,4 @@ def _task_arguments() -> Iterator[tuple[str, list[str]]]:
         content = settings(f"task/{name}")
         shared = [entry[1:].partition("@")[0] for entry in content["defaults"] if str(entry).startswith("/")]
         parts = [content.get("task", content), *map(settings, shared)]
-        yield name, sorted(argument for part in parts for argument in part["evaluation"])
+        yield name, sorted(argument for part in parts for argument in part.get("evaluation", ()))

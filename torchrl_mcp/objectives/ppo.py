@@ -80,6 +80,8 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         bound_coeff: Weight of the penalty, :math:`c`; 0 for distributions without a mean. For a mixture, the penalty
             concerns the mean of the mixture, which may be inside the bounds even if means of primitives are not.
         bound: Largest absolute mean action, :math:`b`.
+        entropy_bonus: Whether the policy's entropy, with its weight ``entropy_coeff``, is part of the loss.
+        entropy_coeff: Weight of the entropy; None takes TorchRL's default. With 0, the entropy is not computed.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
 
     Reference:
@@ -114,9 +116,12 @@ class BoundedClipPPOLoss(ClipPPOLoss):
         *,
         bound_coeff: NotNegative,
         bound: Positive = 1.0,
+        entropy_bonus: bool = True,
+        entropy_coeff: NotNegative | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(actor_network, critic_network, **kwargs)
+        bonus = entropy_bonus and entropy_coeff != 0
+        super().__init__(actor_network, critic_network, entropy_bonus=bonus, entropy_coeff=entropy_coeff, **kwargs)
         self.bound_coeff = bound_coeff
         self.bound = bound
         self.out_keys: list[str] = [*self.out_keys, "loss_bound"]

@@ -157,6 +157,7 @@ class RunSettings(TypedDict):
     action_std: Positive
     learned_std: bool
     clip_epsilon: Positive
+    entropy_coeff: NotNegative
     lmbda: Share
     epsilon: Share
     goal_positions: Positions
