@@ -250,6 +250,13 @@ def test_checkpoints_are_evaluated_after_numbers_of_steps_and_only_once(command,
     assert output.read_text() == first
 
 
+def test_two_searches_that_share_a_table_keep_each_other_s_rows(search, tmp_path):
+    tables = [search.Table(tmp_path / "table.csv") for _ in range(2)]
+    for name, table in zip(("first", "second"), tables, strict=True):
+        table.write(name, 100, [], {"cpu_seconds": 60.0, "score": 1.0})
+    assert [row["trial"] for row in tables[0].rows] == ["first", "second"]
+
+
 def test_every_method_is_searched_over_settings_that_it_has(search):
     for method, noises in search.NOISE.items():
         for settings in noises.values():

@@ -159,6 +159,7 @@ FAULTS = {
     "torchrl_mcp/objectives/ppo.py": [
         ("mean.abs() - self.bound", "mean - self.bound", "objectives/test_ppo.py"),
         ("excess.square().sum(-1)", "excess.square().mean(-1)", "objectives/test_ppo.py"),
+        ("entropy_bonus and entropy_coeff != 0", "entropy_bonus", "objectives/test_ppo.py"),
         ("if target.shape != values.shape", "if False", "objectives/test_values.py"),
     ],
     "torchrl_mcp/objectives/advantages.py": [
