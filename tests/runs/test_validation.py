@@ -55,7 +55,7 @@ def test_settings_of_a_method_hold_in_the_stage_that_they_name():
     assert composed(*place("finetune", "dribble")).action_std == 0.05
     gate = composed(*place("hierarchical", "dribble"))
     assert (gate.training.minibatch_size, gate.optimizer.schedule.max_lr) == (64, 2e-3)
-    assert composed(*place("scratch", "dribble")).training.minibatch_size == 512
+    assert composed(*place("scratch", "dribble")).training.minibatch_size == 2048
 
 
 @pytest.mark.parametrize("word", ["step_size.actor=0.1", "step_size.actor=1e-6", "step_size.max=2e-5"])
