@@ -4,20 +4,23 @@ r"""Evaluates the checkpoints of runs, to show how the lead of one method over a
         method=mcp,latent_space seed=0,1,2,3,4,5,6,7 checkpoint_interval=62 keep_checkpoints=100 run_root=runs/budgets
     python benchmarks/budgets.py runs/budgets
 
-For each transfer in the folder and each number of steps, the script evaluates the first checkpoint that has at least
-as many steps, with 128 deterministic and 128 exploring episodes. ``results/budgets.csv`` has a row per evaluation;
-checkpoints that already have a row are not evaluated again, so that the script can follow runs while they train. The
-picture ``results/budgets.png`` shows the share of successful episodes, averaged over seeds, with 95 % bootstrap
-intervals. The script also prints the difference between the two methods after each number of steps, with an interval
-that resamples seeds. Every seed has a pre-training of its own.
+For each transfer in the folder and each of the numbers of steps in ``BUDGETS``, the script evaluates the first
+checkpoint that has at least as many steps, with 128 deterministic and 128 exploring episodes. A checkpoint with more
+than 5 % too many steps is not evaluated. ``results/budgets.csv`` has a row for each mode of each evaluation.
+Checkpoints that already have rows are not evaluated again, so that the script can be called again and again while runs
+train. The picture ``results/budgets.png`` shows the share of successful episodes, averaged over seeds, with 95 %
+bootstrap intervals. If there are runs of two methods, the script prints the difference between their success rates
+after each number of steps, with an interval that resamples seeds. Every seed has a pre-training of its own.
 """
 
 import argparse
 import csv
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from report import about, table, write
 
 from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure, save_figure
@@ -38,11 +41,11 @@ SEED = 12345
 """Seed of the evaluations, that of the table."""
 
 
-def evaluated(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) -> Iterator[dict[str, Any]]:
+def evaluate(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) -> Iterator[dict[str, Any]]:
     """Yield a row for every checkpoint to be evaluated that has no row yet."""
     present = {(row["method"], int(row["seed"]), int(row["budget"])) for row in rows}
     for run in runs:
-        for budget, checkpoint in chosen(run.path).items():
+        for budget, checkpoint in checkpoints_of(run.path).items():
             if (run.method, run.seed, budget) in present:
                 continue
             evaluation = policies.evaluation(checkpoint, episodes=episodes, seed=SEED)
@@ -64,7 +67,7 @@ def evaluated(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int)
                 }
 
 
-def chosen(folder: Path) -> dict[int, Path]:
+def checkpoints_of(folder: Path) -> dict[int, Path]:
     """Return the checkpoint of a run for each budget: the first one with enough steps and not with far too many."""
     checkpoints = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
     first = {budget: next((c for c in checkpoints if steps_of(c) >= budget), None) for budget in BUDGETS}
@@ -86,25 +89,21 @@ def successes(rows: Sequence[dict[str, Any]]) -> dict[str, dict[int, list[float]
 
 
 def differences(rates: dict[str, dict[int, list[float]]]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each budget that both methods reached: mean success rates and their difference.
-
-    Raises:
-        SystemExit: If there are not two methods.
-    """
-    if len(rates) != 2:
-        raise SystemExit(f"differences need runs of two methods, but there are runs of {', '.join(rates) or 'none'}")
-    (first, ones), (second, others) = rates.items()
-    for budget in sorted(ones.keys() & others.keys()):
-        ahead = statistics.difference(ones[budget], others[budget])
+    """Yield a row for each budget that both of two methods reached: mean success rates and their difference."""
+    first, second = rates
+    for budget in sorted(rates[first].keys() & rates[second].keys()):
+        samples = {method: rates[method][budget] for method in (first, second)}
+        estimate = statistics.difference(*samples.values())
+        interval = "" if math.isnan(estimate.low) else f" [{estimate.low:+.0%}, {estimate.high:+.0%}]"
         yield {
             "steps": f"{budget:,}",
-            **{name: f"{statistics.mean(rates[name][budget]).value:.0%}" for name in (first, second)},
-            "seeds": f"{len(ones[budget])}, {len(others[budget])}",
-            "difference": f"{ahead.value:+.0%} [{ahead.low:+.0%}, {ahead.high:+.0%}]",
+            **{method: f"{statistics.mean(sample).value:.0%}" for method, sample in samples.items()},
+            "seeds": ", ".join(str(len(sample)) for sample in samples.values()),
+            "difference": f"{estimate.value:+.0%}{interval}",
         }
 
 
-def draw(rates: dict[str, dict[int, list[float]]]) -> Any:
+def draw(rates: dict[str, dict[int, list[float]]]) -> Figure:
     """Return a figure of the success rates by steps, with the intervals of the means and a dot for every seed."""
     figure = new_figure(5.2, 3.2)
     axes = figure.add_subplot()
@@ -131,11 +130,12 @@ def main() -> None:
     rows: list[dict[str, Any]] = list(csv.DictReader(arguments.output.open())) if arguments.output.exists() else []
     if arguments.runs:
         runs = [run for run in find_runs([arguments.runs])[0] if run.stage == "transfer"]
-        for row in evaluated(runs, list(rows), episodes=arguments.episodes):
+        for row in evaluate(runs, list(rows), episodes=arguments.episodes):
             rows.append(row)
             write(arguments.output, rows)
     rates = successes(rows)
-    print(table(list(differences(rates))))
+    if len(rates) == 2:
+        print(table(list(differences(rates))))
     save_figure(draw(rates), arguments.output.with_suffix(""))
 
 

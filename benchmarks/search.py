@@ -8,8 +8,7 @@ r"""Searches settings at equal processor time: every trial of every method train
 The protocol is the same for all methods and tasks, in float32 with the biped:
 
 * A trial is a set of settings, which are arguments of ``torchrl-mcp-train``. Optuna's TPE sampler proposes the
-  settings, except for the first two trials: the current defaults, and the defaults with large batches. Every method has
-  the same number of trials.
+  settings, except for the first trial, which has the current defaults. Every method has the same number of trials.
 * A trial trains with the seeds 100 and 101, which no table uses: in imitation from the start, in all other tasks from
   one pre-training of the method (5 M steps). A run is stopped after a number of CPU seconds, counted from its first
   step, so that other work on the machine does not distort the comparison. All trials of a study must run on the same
@@ -54,13 +53,10 @@ CHOICES = {"8192": (32, 1024), "32768": (128, 4096), "131072": (512, 16_384)}
 
 
 def suggest(trial: Any, method: str) -> list[str]:
-    """Return the settings of a trial, which the sampler proposes except for the first two trials."""
-    fixed = trial.user_attrs.get("known")
-    if fixed == "default":
+    """Return the settings of a trial, which the sampler proposes except for the trial with the defaults."""
+    if trial.user_attrs.get("default"):
         return []
     batches = CHOICES if method == "hierarchical" else BATCHES
-    if fixed == "large":
-        return batch_words(*list(batches.values())[-1], minibatches=8, passes=4)
     chosen = batches[trial.suggest_categorical("batch", list(batches))]
     words = batch_words(
         *chosen,
@@ -156,10 +152,8 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
             study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
             if trial.params:
                 study.enqueue_trial(trial.params)
-    tried = {trial.user_attrs.get("known") for trial in study.trials if trial.state.name != "FAIL"}
-    for fixed in ("default", "large"):
-        if fixed not in tried:
-            study.enqueue_trial({}, user_attrs={"known": fixed})
+    if not any(trial.user_attrs.get("default") for trial in study.trials if trial.state.name != "FAIL"):
+        study.enqueue_trial({}, user_attrs={"default": True})
     table = Table(results / f"{name}.csv")
 
     def objective(trial: Any) -> float:

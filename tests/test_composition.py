@@ -124,8 +124,6 @@ def test_tuned_settings_are_of_a_task_and_a_method(task, method):
     assert task in TASKS
     assert method in METHODS
     settings = OmegaConf.load(tuned(task, method))
-    shared = [OmegaConf.load(CONF / f"{name[1:]}.yaml") for name in settings.pop("defaults", [])]
-    settings = OmegaConf.merge(*shared, settings)
     assert settings
     cfg = composed(*place(task, method))
     assert cfg == OmegaConf.merge(cfg, settings)

@@ -81,7 +81,7 @@ class BoundedClipPPOLoss(ClipPPOLoss):
             concerns the mean of the mixture, which may be inside the bounds even if means of primitives are not.
         bound: Largest absolute mean action, :math:`b`.
         entropy_bonus: Whether the policy's entropy, with its weight ``entropy_coeff``, is part of the loss.
-        entropy_coeff: Weight of the entropy; None takes TorchRL's default. With 0, the entropy is not computed.
+        entropy_coeff: Weight of the entropy in nats; None takes TorchRL's default. With 0, the entropy is not computed.
         **kwargs: Passed on to :class:`torchrl.objectives.ClipPPOLoss`.
 
     Reference:
