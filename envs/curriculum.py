@@ -36,8 +36,8 @@ class Curriculum:
         after_success: What a success in carrying or dribbling does to a training episode with ``reward_weights``.
             ``"end"``: the success ends the episode, and is worth the reward for succeeding for ever.
             ``"continue"``: the episode continues, and every step in success earns its share of that reward, so that the
-            character learns to leave the object at the target. ``"staged"``: successes end episodes until more than
-            half of the recent episodes have succeeded; from then on, episodes continue. See
+            character learns to leave the object at the target. ``"staged"``: successes end episodes until more than a
+            quarter of the recent episodes have succeeded; from then on, episodes continue. See
             :class:`~torchrl_mcp.envs.curriculum.SuccessShare`.
         success_worth: Worth of a step in success with ``reward_weights``, as a multiple of the best reward that a step
             without success can have.
@@ -107,11 +107,14 @@ class SuccessShare:
 
     Attributes:
         share: The share.
-        was_reached: Whether the share has exceeded one half so far.
+        was_reached: Whether the share has exceeded ``ENOUGH`` so far.
     """
 
     EPISODES = 1000
     """Number of episodes after which the weight of an episode has fallen by a factor of e."""
+
+    ENOUGH = 0.25
+    """Share above which training episodes continue after a success."""
 
     def __init__(self) -> None:
         self.share = 0.0
@@ -121,4 +124,4 @@ class SuccessShare:
         """Add episodes that have ended, of which some have succeeded."""
         weight = -math.expm1(-episodes / self.EPISODES)
         self.share += weight * (successes / episodes - self.share)
-        self.was_reached |= self.share > 0.5
+        self.was_reached |= self.share > self.ENOUGH
