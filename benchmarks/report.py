@@ -22,7 +22,8 @@ def about() -> dict[str, Any]:
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
     folder = Path(__file__).resolve().parent
-    return {"commit": commit(folder) or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
+    code = commit(folder, results=folder / "results")  # without the tables, which benchmarks write row by row
+    return {"commit": code or "", "date": date.today().isoformat(), **machine("cpu"), **versions}
 
 
 def table(rows: list[dict[str, Any]]) -> str:

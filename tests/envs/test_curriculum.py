@@ -95,7 +95,7 @@ def test_if_episodes_continue_every_step_in_success_earns_its_worth_of_the_full_
 
 @pytest.fixture
 def staged():
-    """Make simulations in which every episode succeeds in its first step, and may go on once a quarter has succeeded."""
+    """Make simulations in which every episode succeeds in its first step, and may go on after a quarter succeeded."""
 
     def of(**kwargs):
         curriculum = {**WEIGHED, "after_success": "staged"}

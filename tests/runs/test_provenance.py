@@ -40,6 +40,20 @@ def test_the_commit_is_that_of_the_checkout_and_says_whether_files_were_changed_
     assert provenance.commit(checkout / "package") == f"{commit}-dirty"
 
 
+def test_a_changed_result_does_not_make_the_commit_dirty_but_changed_code_does(checkout):
+    results = checkout / "results"
+    results.mkdir()
+    (results / "table.csv").write_text("1\n")
+    git(checkout, "add", "results")
+    git(checkout, "commit", "-q", "-m", "two")
+    (results / "table.csv").write_text("2\n")
+    commit = provenance.commit(checkout / "package", results=results)
+    assert git(checkout, "rev-parse", "HEAD").startswith(commit)
+    assert provenance.commit(checkout / "package") == f"{commit}-dirty"
+    (checkout / "package" / "code.py").write_text("2\n")
+    assert provenance.commit(checkout / "package", results=results) == f"{commit}-dirty"
+
+
 def test_what_lies_in_a_checkout_untracked_or_in_none_has_no_commit(checkout, tmp_path_factory):
     installed = checkout / ".venv" / "package"
     installed.mkdir(parents=True)

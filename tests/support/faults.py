@@ -232,6 +232,7 @@ FAULTS = {
         ("if self.discount == 0", "if False", "envs/test_curriculum.py"),
         ("-math.expm1(-episodes / self.EPISODES)", "episodes / self.EPISODES", "envs/test_curriculum.py"),
         ("self.was_reached |= ", "self.was_reached = ", "envs/test_curriculum.py"),
+        ("ENOUGH = 0.25", "ENOUGH = 0.35", "envs/test_curriculum.py"),
     ],
     "envs/initial_states.py": [
         ("shares < self.in_motion", "shares > self.in_motion", "envs/test_initial_states.py"),
@@ -500,7 +501,8 @@ FAULTS = {
         ("if wanted.get(key) == value)}", "if wanted.get(key) != value)}", "runs/test_identity.py"),
     ],
     "torchrl_mcp/runs/provenance.py": [
-        ('"--dirty", ', "", "runs/test_provenance.py"),
+        ('f"{head}-dirty" if', "head if", "runs/test_provenance.py"),
+        ('[f":(exclude){results}"] if results', '[":(exclude)*"] if results', "runs/test_provenance.py"),
         ('*origin.get("extended", []), entry', "entry", LONGER),
     ],
     "torchrl_mcp/runs/lock.py": [

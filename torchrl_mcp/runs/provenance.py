@@ -79,14 +79,21 @@ def launched() -> tuple[list[str], dict[str, str]]:
     return ["torchrl-mcp-train", *hydra.overrides.task], choices
 
 
-def commit(folder: Path) -> str | None:
-    """Return the abbreviated commit of the Git checkout that tracks ``folder``, or None."""
+def commit(folder: Path, *, results: Path | None = None) -> str | None:
+    """Return the abbreviated commit of the Git checkout that tracks ``folder``, or None.
+
+    Args:
+        folder: A folder of the checkout.
+        results: A folder of the checkout whose changes do not make the commit ``-dirty``.
+    """
     if shutil.which("git") is None:
         return None
     # An installed package may lie inside the checkout of another project, which does not track the package.
     if not _git(folder, "ls-files", "."):
         return None
-    return _git(folder, "describe", "--always", "--dirty", "--exclude=*")
+    head = _git(folder, "describe", "--always", "--exclude=*")
+    ignored = [f":(exclude){results}"] if results else []
+    return f"{head}-dirty" if _git(folder, "diff", "--name-only", "HEAD", "--", ":/", *ignored) else head
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
