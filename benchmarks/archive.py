@@ -182,19 +182,19 @@ def line(cell: Cell) -> dict[str, Any]:
 def times(of_task: Sequence[Cell]) -> Iterator[dict[str, Any]]:
     """Yield the last columns of each row of the table of a task: minutes of training, speed of learning, commits.
 
-    The speed is the time until a learning curve reaches 0.8 of the highest final return of the table. Where a success
-    ends the training episode, this return is reached soon and says little. The speed is then the time until the share
-    of steps with a success is half of the highest final share; the column is omitted for archives without this share.
+    The speed is the time until a learning curve reaches 0.8 of the highest final return of the table. In tasks that
+    define success, easy training episodes reach this return soon. The speed is then the time until the share of steps
+    with a success is half of the highest final share; the column is omitted for archives without this share.
     """
-    ends_at_success = any("success" in cell.metrics for cell in of_task)
-    quantity = SUCCESS if ends_at_success else NORMALISED_RETURN
-    share_of_best = 0.5 if ends_at_success else 0.8
-    name = "to half" if ends_at_success else "to 0.8"
+    defines_success = any("success" in cell.metrics for cell in of_task)
+    quantity = SUCCESS if defines_success else NORMALISED_RETURN
+    share_of_best = 0.5 if defines_success else 0.8
+    name = "to half" if defines_success else "to 0.8"
     curves = [learning_curve(cell, quantity) for cell in of_task]
     final = [float(curve.mean[-1]) for curve in curves if curve]
     for cell, curve in zip(of_task, curves, strict=True):
         taken = minutes_to(cell, curve, share_of_best * max(final)) if curve else None
-        speed = {name: EMPTY if taken is None else f"{taken:.1f}"} if final or not ends_at_success else {}
+        speed = {name: EMPTY if taken is None else f"{taken:.1f}"} if final or not defines_success else {}
         yield {"minutes": round(cell.seconds / 60)} | speed | {"commit": ", ".join(cell.commits)}
 
 

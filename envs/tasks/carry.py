@@ -61,8 +61,7 @@ class Carry(Transport):
     **Reward.** By default, the reward is the paper's. Two variants of the same authors' public code are options: the
     distance to the target instead of its square, which still has a gradient at 10 m, and reward 1 while successful. A
     box at rest on the target earns at most 0.73 with the paper's reward, and 1 with the second variant. With
-    ``reward_weights`` of a curriculum, training uses :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and
-    ``after_success`` says whether a success ends the episode.
+    ``reward_weights`` of a curriculum, training uses :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.

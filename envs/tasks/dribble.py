@@ -49,8 +49,7 @@ class Dribble(Transport):
 
     **Reward.** The reward has the variants of :class:`~torchrl_mcp.envs.Carry`. A ball at rest at the target earns at
     most 0.73 with the paper's reward. With ``reward_weights`` of a curriculum, training uses
-    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`, and ``after_success`` says whether a success ends the
-    episode.
+    :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.

@@ -205,37 +205,30 @@ def training_reward(
     *,
     weights: Sequence[float],
     speed: float,
-    discount: float,
     worth: float,
-    ends: bool,
 ) -> Tensor:
     r"""Reward for training to carry and dribble: about zero for standing still, and greatest for a success.
 
     .. math::
         r' = \begin{cases}
-            c \, \frac{\sum_i w_i - r_{idle}}{1 - \gamma} & \text{after a success that ends the episode} \\
-            c \, (\sum_i w_i - r_{idle}) & \text{in every step in success, if episodes continue} \\
+            c \, (\sum_i w_i - r_{idle}) & \text{in success} \\
             r - r_{idle} & \text{else}
         \end{cases}
 
-    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A success
-    that ends the episode is worth the discounted return of all terms being 1 for ever: otherwise a character that walks
-    on knocks the box off the target, and a success is worth little. If episodes continue, only a character that stays
-    in success for ever earns as much. A character that holds the box just beside the target earns nearly as much with
-    :math:`c = 1`, so that a larger worth makes characters put it down.
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. With
+    :math:`c = 1`, a step in success earns as much as if all terms were 1, although the object should rest there. A
+    character that holds the box just beside the target earns nearly as much, so that only a larger worth makes
+    characters put it down.
 
     Args:
         reward: :func:`transport_reward` with these weights, shape ``(*B)``.
         success: Whether the object is at its target, shape ``(*B)``, bool.
         weights: :math:`(w^{cv}, w^{cp}, w^{bv}, w^{bp})`.
         speed: Target speed :math:`\hat{v}`, in m/s, for the :func:`idle_reward`.
-        discount: Discount factor :math:`\gamma` of the learner, below 1.
-        worth: Worth of a success as a multiple of the best reward without it, :math:`c`.
-        ends: Whether a success ends the episode.
+        worth: Worth of a step in success as a multiple of the best reward without it, :math:`c`.
 
     Returns:
         Reward, shape ``(*B)``.
     """
     idle = idle_reward(weights, speed)
-    of_success = worth * (sum(weights) - idle)
-    return (reward - idle).masked_fill(success, of_success / (1 - discount) if ends else of_success)
+    return (reward - idle).masked_fill(success, worth * (sum(weights) - idle))

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.characters.mirror import BODY_SIGNS, VECTOR_SIGNS, Mirror, mirror_signs
-from torchrl_mcp.envs.curriculum import SuccessShare
 from torchrl_mcp.envs.ideal import transport_reach
 from torchrl_mcp.envs.observations import SIZES, UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
@@ -120,15 +119,6 @@ class Transport(PDCharacterEnv):
         }
         self.ranges = Ranges(ranges, self.curriculum.mixture)
         self.ranges.require_distances("object_distances", "target_distances")
-        self._success_share = SuccessShare()
-        self._successes = 0  # successes that have ended episodes since the last episode began
-
-    @property
-    def ends_at_success(self) -> bool:
-        """Whether a success ends an episode, as the curriculum says; a task's own episodes continue."""
-        if self.curriculum.reward_weights is None or self.curriculum.after_success == "continue":
-            return False
-        return self.curriculum.after_success == "end" or not self._success_share.was_reached
 
     def begin_with(self, object: str, target: str) -> None:
         """Look at the object and the target, bodies of the scene by name, and measure the object's velocity."""
@@ -138,9 +128,6 @@ class Transport(PDCharacterEnv):
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The character, with object and target at drawn places around it."""
-        if num:
-            self._success_share.count(num, self._successes)
-        self._successes = 0
         start = super().initial_state(num)
         drawn = self.ranges.draw(num, self.generator)
         direction = drawn["object_directions"]
@@ -202,32 +189,8 @@ class Transport(PDCharacterEnv):
             self.success(),
             weights=weights,
             speed=self.speed,
-            discount=self.curriculum.discount,
             worth=self.curriculum.success_worth,
-            ends=self.ends_at_success,
         )
-
-    def terminated(self) -> Tensor:
-        """A success, if it ends the episode."""
-        if not self.ends_at_success:
-            return super().terminated()
-        success = self.success()
-        self._successes = int(success.sum())
-        return success
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """See :meth:`.CharacterEnv.get_extra_state`: also the share of successes in recent episodes."""
-        return super().get_extra_state() | {
-            "success_share": dict(vars(self._success_share)),
-            "successes": self._successes,
-        }
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See :meth:`.CharacterEnv.set_extra_state`."""
-        super().set_extra_state(state)
-        if "success_share" in state:  # absent in checkpoints of earlier versions
-            vars(self._success_share).update(state["success_share"])
-            self._successes = state["successes"]
 
     def motion(self) -> tuple[Tensor, ...]:
         """Horizontal centre of mass, its velocity, object, its velocity, and target, each ``(N, 2)``."""

@@ -8,7 +8,6 @@ import torch
 from refusals import refused
 
 from torchrl_mcp.envs import Carry, Dribble, Heading
-from torchrl_mcp.envs.curriculum import SuccessShare
 
 WEIGHTS = [0.6, 0.1, 1.0, 2.0]
 WEIGHED = {"reward_weights": WEIGHTS}
@@ -53,25 +52,6 @@ def test_what_is_learnt_from_counts_speeds_from_standing_still(task):
         np.testing.assert_allclose(state["reward"].squeeze(-1), expected, atol=1e-5)
 
 
-def test_a_success_ends_the_episode_with_the_return_of_full_reward_for_ever():
-    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 1.0), "terminate_on_fall": False}
-    env = make(Dribble, curriculum={**WEIGHED, "discount": 0.9}, **there)
-    full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
-    for_ever = sum(full * 0.9**step for step in range(1000))
-    state, generator, successes, others = env.reset(), torch.Generator().manual_seed(0), 0, 0
-    for _ in range(60):
-        action = 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
-        taken, state = env.step_and_maybe_reset(state.set("action", action))
-        success, standing = taken["next", "success"], taken["next", "task_reward"] != 0  # who has fallen earns nothing
-        assert torch.equal(taken["next", "terminated"], success)
-        ended = taken["next", "reward"][success & standing]
-        torch.testing.assert_close(ended, torch.full_like(ended, for_ever))
-        assert (taken["next", "reward"][~success] < full).all()
-        successes, others = successes + len(ended), others + int((~success).sum())
-    assert successes > 0
-    assert others > 0
-
-
 AT_THE_TARGET = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
 
 
@@ -82,8 +62,8 @@ def stand(env, state):
 
 
 @pytest.mark.parametrize("worth", [1, 2.5])
-def test_if_episodes_continue_every_step_in_success_earns_its_worth_of_the_full_reward(worth):
-    env = make(Dribble, curriculum={**WEIGHED, "after_success": "continue", "success_worth": worth}, **AT_THE_TARGET)
+def test_every_step_in_success_earns_its_worth_of_the_full_reward_and_does_not_end_the_episode(worth):
+    env = make(Dribble, curriculum={**WEIGHED, "success_worth": worth}, **AT_THE_TARGET)
     full = 0.6 * (1 - math.exp(-1.5)) + 0.1 + 1.0 * (1 - math.exp(-1)) + 2.0
     state = env.reset()
     for _ in range(3):
@@ -93,77 +73,8 @@ def test_if_episodes_continue_every_step_in_success_earns_its_worth_of_the_full_
         torch.testing.assert_close(outcome["reward"], torch.full((4, 1), worth * full))
 
 
-@pytest.fixture
-def staged():
-    """Make simulations in which every episode succeeds in its first step, and may go on after a quarter succeeded."""
-
-    def of(**kwargs):
-        curriculum = {**WEIGHED, "after_success": "staged"}
-        return make(Dribble, 64, curriculum=curriculum, **{**AT_THE_TARGET, **kwargs})
-
-    return of
-
-
-def test_staged_episodes_end_at_a_success_until_a_quarter_has_succeeded(staged):
-    env = staged()
-    state = env.reset()
-    ended = []
-    for _ in range(14):
-        outcome, state = stand(env, state)
-        assert outcome["success"].all()
-        ended.append(outcome["terminated"].all().item())
-        assert ended[-1] == outcome["terminated"].any()
-    steps = next(steps for steps in range(1, 100) if 1 - math.exp(-64 * steps / 1000) > 0.25)  # each ends 64 episodes
-    assert ended == [True] * steps + [False] * (14 - steps)
-
-
-def test_staged_episodes_keep_ending_at_a_success_while_most_fail(staged):
-    env = staged(target_distances=(9.0, 10.0), max_episode_steps=1)
-    state = env.reset()
-    for _ in range(30):
-        outcome, state = stand(env, state)
-        assert outcome["truncated"].all()
-        assert not outcome["success"].any()
-    assert env.ends_at_success
-
-
-def test_a_restored_environment_continues_in_the_stage_in_which_it_was(staged):
-    first = staged()
-    state = first.reset()
-    for _ in range(13):
-        _, state = stand(first, state)
-    second = staged()
-    assert second.ends_at_success
-    second.load_state_dict(first.state_dict())
-    outcome, _ = stand(second, second.reset())
-    assert not outcome["terminated"].any()
-
-
-def test_a_share_of_successes_is_a_mean_in_which_old_episodes_weigh_less():
-    generator = np.random.default_rng(0)
-    share = SuccessShare()
-    outcomes = np.zeros(0)
-    for num in generator.integers(1, 40, size=200):
-        succeeded = generator.random(num) < 0.2
-        share.count(int(num), int(succeeded.sum()))
-        outcomes = np.append(outcomes, np.full(num, succeeded.mean()))
-    weights = np.exp((np.arange(1, len(outcomes) + 1) - len(outcomes)) / 1000)
-    expected = (weights * outcomes).sum() * -math.expm1(-1 / 1000)
-    assert share.share == pytest.approx(expected, rel=1e-9)
-    assert not share.was_reached
-
-
-def test_a_share_that_was_reached_remains_so_whatever_comes_next():
-    share = SuccessShare()
-    for successes in (1000, 0, 0):
-        share.count(1000, successes)
-        assert share.was_reached
-    assert share.share < 0.25
-
-
 def test_without_weights_a_success_does_not_end_the_episode():
-    there = {"object_distances": (0.5, 0.6), "target_distances": (0.0, 0.1), "terminate_on_fall": False}
-    outcome = outcomes(make(Dribble, **there), 1)[0][0]
+    outcome = outcomes(make(Dribble, **AT_THE_TARGET), 1)[0][0]
     assert outcome["success"].all()
     assert not outcome["terminated"].any()
 
@@ -202,11 +113,7 @@ def test_standing_still_far_from_everything_earns_nothing():
         (Dribble, {"reward_weights": [1.0] * 3}, "reward_weights=[1.0, 1.0, 1.0]"),  # of four terms
         (Carry, {"reward_weights": [1.0] * 5}, "reward_weights=[1.0, 1.0, 1.0, 1.0, 1.0]"),
         (Heading, {"reward_weights": [1.0] * 4}, "reward_weights=[1.0, 1.0, 1.0, 1.0]"),  # of none
-        (Dribble, {"reward_weights": WEIGHTS, "discount": 1}, "discount=1"),
-        (Dribble, {"reward_weights": WEIGHTS, "after_success": "stop"}, "after_success"),
         (Dribble, {"reward_weights": WEIGHTS, "success_worth": 0}, "success_worth"),
-        (Heading, {"discount": 0}, "discount=0"),
-        (Heading, {"discount": 1.1}, "discount=1.1"),
         (Heading, {"emphasis": None}, "'emphasis'"),
         (Heading, "none", "curriculum='none'"),
     ],

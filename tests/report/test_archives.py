@@ -84,7 +84,7 @@ def test_minutes_until_four_fifths_of_the_best_return_are_those_of_the_learning_
     assert times["finetune"] is None
 
 
-def test_where_success_ends_episodes_it_is_the_minutes_until_half_of_the_best_share_of_successes(
+def test_in_tasks_that_define_success_it_is_the_minutes_until_half_of_the_best_share_of_successes(
     write_run, archive, tmp_path
 ):
     for method, best in (("scratch", 0.001), ("finetune", 0.0006), ("moe", None)):

@@ -188,7 +188,7 @@ class Bench(Heading):
         ("max_episode_steps", 0),
         ("speed", -1.0),
         ("physics_timestep", 0.0),
-        ("curriculum.discount", 2),
+        ("curriculum.success_worth", 0),
     ],
 )
 @pytest.mark.parametrize("group", ["transfer", "evaluation"])
