@@ -90,9 +90,8 @@ def successes(rows: Sequence[dict[str, Any]]) -> dict[str, dict[int, list[float]
 
 def differences(rates: dict[str, dict[int, list[float]]]) -> Iterator[dict[str, Any]]:
     """Yield a row for each budget that both of two methods reached: mean success rates and their difference."""
-    first, second = rates
-    for budget in sorted(rates[first].keys() & rates[second].keys()):
-        samples = {method: rates[method][budget] for method in (first, second)}
+    for budget in sorted(set.intersection(*(set(reached) for reached in rates.values()))):
+        samples = {method: of_method[budget] for method, of_method in rates.items()}
         estimate = statistics.difference(*samples.values())
         interval = "" if math.isnan(estimate.low) else f" [{estimate.low:+.0%}, {estimate.high:+.0%}]"
         yield {

@@ -215,10 +215,10 @@ def training_reward(
             r - r_{idle} & \text{else}
         \end{cases}
 
-    With the printed reward, standing still earns a third of the best return, and policies learn to stand. With
-    :math:`c = 1`, a step in success earns as much as if all terms were 1, although the object should rest there. A
-    character that holds the box just beside the target earns nearly as much, so that only a larger worth makes
-    characters put it down.
+    With the printed reward, standing still earns a third of the best return, and policies learn to stand. A step in
+    success earns :math:`c` times as much as a step in which all terms are 1, because an object at rest loses the
+    reward for its speed. With :math:`c = 1`, a character that holds the box just beside the target earns nearly as
+    much as a character that has put the box down, so that carrying needs a larger :math:`c`.
 
     Args:
         reward: :func:`transport_reward` with these weights, shape ``(*B)``.
