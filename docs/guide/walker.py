@@ -24,7 +24,7 @@ class Walkers(SerialEnv):
 
 
 class TaskAsGoal(Transform):
-    """The task, one-hot, as ``goal``."""
+    """The task in one-hot encoding, as ``goal``."""
 
     def __init__(self, task: str) -> None:
         super().__init__(out_keys=["goal"])
