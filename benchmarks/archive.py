@@ -12,6 +12,7 @@ import tarfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -98,12 +99,14 @@ def pack(root: Path, archive: Path) -> None:
 
 
 def curve(metrics: Path) -> str:
-    """Return the metrics of a run with only the columns of ``CURVE``."""
+    """Return the metrics of a run with those columns of ``CURVE`` that the run has."""
     columns = io.StringIO()
     with metrics.open(newline="") as file:
-        writer = csv.DictWriter(columns, CURVE, extrasaction="ignore", lineterminator="\n")
+        rows = csv.DictReader(file)
+        known = [name for name in CURVE if name in (rows.fieldnames or ())]
+        writer = csv.DictWriter(columns, known, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(csv.DictReader(file))
+        writer.writerows(rows)
     return columns.getvalue()
 
 
@@ -161,18 +164,19 @@ def line(cell: Cell) -> dict[str, Any]:
         "": label(cell),
         "seeds": len(cell.by_seed),
         "steps": f"{cell.complete[0].frames:,}",
-        "deterministic": f"{average(cell.returns()):.3f}{deviation}",
-        "stochastic": f"{average(cell.returns('stochastic')):.3f}",
-        "fallen": f"{average([numbers['terminated'] for numbers in chosen]):.0%}",
+        "deterministic": f"{fmean(cell.returns()):.3f}{deviation}",
+        "stochastic": f"{fmean(cell.returns('stochastic')):.3f}",
     }
+    ended = fmean([numbers["terminated"] for numbers in chosen])
+    if cell.place[0] != "imitation":
+        facts["terminated" if cell.place[0] == "holdout" else "fallen"] = f"{ended:.0%}"
     if "success" in cell.metrics:
         facts["success"] = f"{cell.metrics['success']:.0%}"
         if cell.success_return is not None:
             facts["success pays 1"] = f"{cell.success_return:.3f}"
     if cell.place[0] == "imitation":
-        facts["completed"] = f"{1 - average([numbers['terminated'] for numbers in chosen]):.0%}"
+        facts["completed"] = f"{1 - ended:.0%}"
         facts["tracking error"] = f"{cell.metrics['tracking_error']:.3f} m"
-        del facts["fallen"]
     else:
         facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
         facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
@@ -220,17 +224,12 @@ def score(cell: Cell | None) -> str:
     if cell is None:
         return EMPTY
     success = f", {share(cell)}" if share(cell) else EMPTY
-    return f"{average(cell.returns()):.3f}{success} ({len(cell.by_seed)})"
+    return f"{fmean(cell.returns()):.3f}{success} ({len(cell.by_seed)})"
 
 
 def share(cell: Cell) -> str:
     """Return the share of successful episodes, or an empty text for tasks that do not define success."""
     return f"{cell.metrics['success']:.0%}" if "success" in cell.metrics else EMPTY
-
-
-def average(values: Sequence[float]) -> float:
-    """Return the mean of values."""
-    return sum(values) / len(values)
 
 
 def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:

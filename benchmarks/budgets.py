@@ -1,16 +1,17 @@
-r"""Evaluates the checkpoints of runs, to show how the lead of one method over another depends on the number of steps.
+r"""Evaluates checkpoints of the biped's dribbling, to show how the lead of one method depends on the number of steps.
 
     torchrl-mcp-train benchmark=table2 preset=comparison autocast=false task=dribble character=biped \
         method=mcp,latent_space seed=0,1,2,3,4,5,6,7 checkpoint_interval=62 keep_checkpoints=100 run_root=runs/budgets
     python benchmarks/budgets.py runs/budgets
 
-For each transfer in the folder and each of the numbers of steps in ``BUDGETS``, the script evaluates the first
-checkpoint that has at least as many steps, with 128 deterministic and 128 exploring episodes. A checkpoint with more
-than 5 % too many steps is not evaluated. ``results/budgets.csv`` has a row for each mode of each evaluation.
+For each transfer to this task in the folder and each of the numbers of steps in ``BUDGETS``, the script evaluates the
+first checkpoint that has at least as many steps, with 128 deterministic and 128 exploring episodes. A checkpoint with
+more than 5 % too many steps is not evaluated. ``results/budgets.csv`` has a row for each mode of each evaluation.
 Checkpoints that already have rows are not evaluated again, so that the script can be called again and again while runs
-train. The picture ``results/budgets.png`` shows the share of successful episodes, averaged over seeds, with 95 %
-bootstrap intervals. If there are runs of two methods, the script prints the difference between their success rates
-after each number of steps, with an interval that resamples seeds. Every seed has a pre-training of its own.
+train; delete the rows of runs that were repeated. The picture ``results/budgets.png`` shows the share of successful
+episodes, averaged over seeds, with 95 % bootstrap intervals. If there are runs of two methods, the script prints the
+difference between their success rates after each number of steps, with an interval that resamples seeds. Every seed has
+a pre-training of its own.
 """
 
 import argparse
@@ -21,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from report import about, table, write
+from report import about, append, table
 
 from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure, save_figure
 from torchrl_mcp.evaluation import statistics
 from torchrl_mcp.report.results import Run, find_runs
 from torchrl_mcp.runs import policies
-from torchrl_mcp.training.run_folder import CHECKPOINTS, MODES
+from torchrl_mcp.training.run_folder import MODES, find_all, frames
 
 RESULTS = Path(__file__).resolve().parent / "results" / "budgets.csv"
 
@@ -40,16 +41,18 @@ TOLERANCE = 0.05
 SEED = 12345
 """Seed of the evaluations, that of the table."""
 
+PLACE = ("dribble", "biped")
+"""Task and character of the runs."""
+
 
 def evaluate(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) -> Iterator[dict[str, Any]]:
     """Yield a row for every checkpoint to be evaluated that has no row yet."""
-    present = {(row["method"], int(row["seed"]), int(row["budget"])) for row in rows}
+    present = {(row["method"], int(row["seed"]), int(row["budget"]), row["mode"]) for row in rows}
     for run in runs:
         for budget, checkpoint in checkpoints_of(run.path).items():
-            if (run.method, run.seed, budget) in present:
-                continue
-            evaluation = policies.evaluation(checkpoint, episodes=episodes, seed=SEED)
-            for mode in MODES:
+            missing = [mode for mode in MODES if (run.method, run.seed, budget, mode) not in present]
+            evaluation = policies.evaluation(checkpoint, episodes=episodes, seed=SEED) if missing else {}
+            for mode in missing:
                 numbers = evaluation[mode]
                 yield {
                     "task": run.place[0],
@@ -57,7 +60,7 @@ def evaluate(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) 
                     "method": run.method,
                     "seed": run.seed,
                     "budget": budget,
-                    "steps": steps_of(checkpoint),
+                    "steps": frames(checkpoint),
                     "mode": mode,
                     "success": numbers["metrics"]["success"],
                     "place": numbers["reach"]["place"],
@@ -69,14 +72,9 @@ def evaluate(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) 
 
 def checkpoints_of(folder: Path) -> dict[int, Path]:
     """Return the checkpoint of a run for each budget: the first one with enough steps and not with far too many."""
-    checkpoints = sorted((folder / CHECKPOINTS).glob("checkpoint-*.torchrl"))
-    first = {budget: next((c for c in checkpoints if steps_of(c) >= budget), None) for budget in BUDGETS}
-    return {budget: c for budget, c in first.items() if c and steps_of(c) <= (1 + TOLERANCE) * budget}
-
-
-def steps_of(checkpoint: Path) -> int:
-    """Return the environment steps of a checkpoint, which its name contains."""
-    return int(checkpoint.stem.removeprefix("checkpoint-"))
+    checkpoints = find_all(folder)[::-1]
+    first = {budget: next((c for c in checkpoints if frames(c) >= budget), None) for budget in BUDGETS}
+    return {budget: c for budget, c in first.items() if c and frames(c) <= (1 + TOLERANCE) * budget}
 
 
 def successes(rows: Sequence[dict[str, Any]]) -> dict[str, dict[int, list[float]]]:
@@ -128,10 +126,10 @@ def main() -> None:
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = list(csv.DictReader(arguments.output.open())) if arguments.output.exists() else []
     if arguments.runs:
-        runs = [run for run in find_runs([arguments.runs])[0] if run.stage == "transfer"]
+        runs = [run for run in find_runs([arguments.runs])[0] if run.stage == "transfer" and run.place == PLACE]
         for row in evaluate(runs, list(rows), episodes=arguments.episodes):
             rows.append(row)
-            write(arguments.output, rows)
+            append(arguments.output, row)
     rates = successes(rows)
     if len(rates) == 2:
         print(table(list(differences(rates))))

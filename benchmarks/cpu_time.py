@@ -13,6 +13,10 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from torchrl_mcp.envs.characters.contract import CONTROL_TIMESTEP
+from torchrl_mcp.runs.provenance import processor_facts
+from torchrl_mcp.training.run_folder import MODES, find_all, frames
+
 EVALUATION_SEED = "777"
 EPISODES = "128"
 
@@ -83,24 +87,21 @@ def scored(training: Training, seconds: float) -> dict[str, Any]:
     subprocess.run([str(word) for word in words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     evaluation = json.loads(output.read_text())
     row: dict[str, Any] = {"cpu_seconds": used}
-    for mode in ("deterministic", "stochastic"):
+    for mode in MODES:
         numbers = evaluation[mode]
         row |= {
             f"{mode}_return": round(numbers["normalised_return"], 4),
             f"{mode}_success": numbers["metrics"].get("success"),
-            f"{mode}_success_seconds": round(numbers["durations"].get("success", 0) / 30, 3),
+            f"{mode}_success_seconds": round(CONTROL_TIMESTEP * numbers["durations"].get("success", 0), 3),
             f"{mode}_falls": numbers["terminated"],
         }
-    newest = max(training.folder.glob("checkpoints/checkpoint-*.torchrl"))
-    row["steps"] = int(newest.stem.removeprefix("checkpoint-"))
-    modes = ("deterministic", "stochastic")
-    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in modes)
+    row["steps"] = frames(find_all(training.folder)[0])
+    row["score"] = mean(row[f"{mode}_return"] + (row[f"{mode}_success"] or 0) for mode in MODES)
     return row
 
 
 def processor() -> str:
     """Return the name of the processor."""
-    fields = dict(line.split(":", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line)
-    names = {name.strip(): value.strip() for name, value in fields.items()}
-    family = f"family {names.get('cpu family')} model {names.get('model')}"
-    return f"{names.get('model name', platform.machine())} {family}"
+    facts = processor_facts()
+    family = f"family {facts.get('cpu family')} model {facts.get('model')}"
+    return f"{facts.get('model name', platform.machine())} {family}"

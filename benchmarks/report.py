@@ -3,6 +3,7 @@
 The library is imported inside functions, because benchmarks also run contenders in interpreters without the library.
 """
 
+import csv
 import importlib.metadata
 from contextlib import suppress
 from datetime import date
@@ -38,6 +39,20 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
     from torchrl_mcp.runs.tables import write_csv
 
     write_csv(rows, path)
+
+
+def append(path: Path, row: dict[str, Any]) -> None:
+    """Append a row to a CSV file, to which other processes may append too.
+
+    The columns are those of the file; an entry that the row lacks is empty.
+    """
+    if path.exists():
+        with path.open(newline="") as file:
+            columns = next(csv.reader(file))
+        with path.open("a", newline="") as file:
+            csv.DictWriter(file, columns, restval="", extrasaction="ignore").writerow(row)
+    else:
+        write(path, [row])
 
 
 def peak_memory(pid: int) -> float:

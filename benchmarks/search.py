@@ -7,8 +7,8 @@ r"""Searches settings at equal processor time: every trial of every method train
 
 The protocol is the same for all methods and tasks, in float32 with the biped:
 
-* A trial is a set of settings, which are arguments of ``torchrl-mcp-train``. Optuna's TPE sampler proposes the
-  settings, except for the first trial, which has the current defaults. Every method has the same number of trials.
+* A trial is a set of settings, which are arguments of ``torchrl-mcp-train``. Optuna draws the settings at
+  random, except for the first trial, which has the current defaults. Every method has the same number of trials.
 * A trial trains with the seeds 100 and 101, which no table uses: in imitation from the start, in all other tasks from
   one pre-training of the method (5 M steps). A run is stopped after a number of CPU seconds, counted from its first
   step, so that other work on the machine does not distort the comparison. All trials of a study must run on the same
@@ -34,7 +34,7 @@ from statistics import mean
 from typing import Any
 
 from cpu_time import Training, processor, scored
-from report import about, write
+from report import about, append
 
 SEEDS = (100, 101)
 """Seeds of the trials. Tables use seeds from 0."""
@@ -53,7 +53,7 @@ CHOICES = {"8192": (32, 1024), "32768": (128, 4096), "131072": (512, 16_384)}
 
 
 def suggest(trial: Any, method: str) -> list[str]:
-    """Return the settings of a trial, which the sampler proposes except for the trial with the defaults."""
+    """Return the settings of a trial, which the sampler draws except for the trial with the defaults."""
     if trial.user_attrs.get("default"):
         return []
     batches = CHOICES if method == "hierarchical" else BATCHES
@@ -144,7 +144,7 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
         storage=JournalStorage(JournalFileBackend(str(results / "search.journal"))),
         load_if_exists=True,
         direction="maximize",
-        sampler=optuna.samplers.TPESampler(seed=SEEDS[0], multivariate=True, n_startup_trials=6),
+        sampler=optuna.samplers.RandomSampler(seed=SEEDS[0]),
         pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=2, min_early_stopping_rate=0),
     )
     for trial in study.trials:
@@ -191,7 +191,8 @@ def interval(words: Sequence[str]) -> str:
     """
     from torchrl_mcp.runs.configuration import compose_run
 
-    frames = compose_run(*words).training.frames_per_batch
+    cfg = compose_run(*words)
+    frames = cfg.training.frames_per_batch * cfg.get("batch_factor", 1)
     return f"checkpoint_interval={max(1, STEPS_PER_CHECKPOINT // frames)}"
 
 
@@ -236,10 +237,10 @@ class Table:
             return list(csv.DictReader(file))
 
     def write(self, trial: int | str, seed: int, settings: Sequence[str], numbers: dict[str, Any]) -> None:
-        """Add a row, and write the file."""
+        """Add a row."""
         row = {"trial": trial, "seed": seed, **numbers, "settings": " ".join(settings)}
         row |= {"processor": processor(), "commit": about()["commit"]}
-        write(self.path, [*self.rows, row])
+        append(self.path, row)
 
     def score(self, trial: int) -> float:
         """Return the mean score of a trial's seeds in its last evaluation."""
@@ -250,14 +251,18 @@ class Table:
         """Return whether the table contains a row of a run.
 
         Raises:
-            SystemExit: If a row of the trial and seed has other settings or fewer CPU seconds.
+            SystemExit: If a row of the trial and seed has another commit, and thus perhaps other defaults, other
+                settings or other CPU seconds.
         """
         rows = [row for row in self.rows if row["trial"] == trial and row["seed"] == str(seed)]
-        if any(row["settings"] != " ".join(settings) or float(row["cpu_seconds"]) < seconds for row in rows):
-            raise SystemExit(
-                f"{self.path} has rows of {trial} with other settings or seconds: remove these rows, or rename the "
-                "candidate"
-            )
+        expected = (" ".join(settings), about()["commit"])
+        for row in rows:
+            alike = seconds <= float(row["cpu_seconds"]) <= 1.05 * seconds + 1
+            if not alike or (row["settings"], row["commit"]) != expected:
+                raise SystemExit(
+                    f"{self.path} has rows of {trial} with another commit, other settings or seconds: remove these "
+                    "rows, or rename the candidate"
+                )
         return bool(rows)
 
 

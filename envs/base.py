@@ -154,6 +154,10 @@ class CharacterEnv(EnvBase):
             given to the constructor, each ``(num, ...)``.
         """
 
+    def first_episodes(self) -> dict[str, Tensor]:
+        """Entries of the state with which episodes begin after a reset of all simulations, each ``(N, ...)``."""
+        return {}
+
     @abstractmethod
     def observe(self, ids: Tensor | slice) -> dict[str, Tensor]:
         """Observe simulations: ``observation``, ``goal`` and, for metrics, flags and numbers under other names.
@@ -408,7 +412,9 @@ class CharacterEnv(EnvBase):
             self._snapshot = None
             return self._reset(snapshot, set_state=True)
         ids = self._everybody if mask is None else mask.view(self.num_envs).nonzero().squeeze(-1)
-        return self._begin_episodes(ids, self._checked(tensordict, ids) if set_state else {})
+        if set_state:
+            return self._begin_episodes(ids, self._checked(tensordict, ids))
+        return self._begin_episodes(ids, self.first_episodes() if mask is None else {})
 
     def _begin_episodes(self, ids: Tensor, state: dict[str, Tensor]) -> TensorDict:
         """Begin episodes in the simulations ``ids``; entries that ``state`` lacks are drawn."""

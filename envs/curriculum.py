@@ -34,7 +34,6 @@ class Curriculum:
         reward_weights: Weights of the terms of the reward in training; None to train with the task's own reward.
         success_worth: Worth of a step in success in carrying or dribbling with ``reward_weights``, as a multiple of the
             best reward that a step without success can have.
-        target_distance_power: Power of the distance to the target in a reward with ``reward_weights``.
         random_first_length: Whether to shorten the first episodes by different lengths, spread evenly over the
             simulations. Then simulations are at different times of their episodes; otherwise a batch of short
             trajectories would cover a single time.
@@ -57,7 +56,6 @@ class Curriculum:
     mixture: Sequence[Alternative] = ()
     reward_weights: Weights | None = None
     success_worth: Positive = 1
-    target_distance_power: NotNegative = 1
     random_first_length: bool = False
 
     def __post_init__(self) -> None:

@@ -280,13 +280,17 @@ class PDCharacterEnv(CharacterEnv):
         return self._centre + action * self._scale
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
-        """Return the scene at rest, with the character and the length of first episodes as the curriculum says.
+        """Return the scene at rest, with the character as the curriculum says.
 
         Tasks add what they draw.
         """
         qvel = torch.zeros(num, self.simulation.model.nv, dtype=torch.float64, device=self.device)
         start = self.initial_states.fill({"qpos": self._rest.repeat(num, 1), "qvel": qvel}, self.generator)
         start |= {name: rest.repeat(num, 1, 1) for name, rest in self._mocap_rest.items()}
-        if self.curriculum.random_first_length and num == self.num_envs:
-            start["elapsed_steps"] = (self._everybody * self.max_episode_steps // num).unsqueeze(-1)
         return start
+
+    def first_episodes(self) -> dict[str, Tensor]:
+        """Elapsed steps, if the curriculum shortens first episodes."""
+        if not self.curriculum.random_first_length:
+            return {}
+        return {"elapsed_steps": (self._everybody * self.max_episode_steps // self.num_envs).unsqueeze(-1)}

@@ -265,11 +265,37 @@ def test_every_method_is_searched_over_settings_that_it_has(search):
 
 
 @pytest.mark.parametrize(
-    ("settings", "iterations"), [([], 4), (["training.num_envs=32", "training.frames_per_batch=1024"], 64)]
+    ("method", "settings", "iterations"),
+    [
+        ("mcp", [], 4),  # 65,536 steps in batches of 16,384
+        ("mcp", ["training.num_envs=32", "training.frames_per_batch=1024"], 64),
+        ("hierarchical", [], 2),  # its batches have eight times 4,096 steps
+    ],
 )
-def test_checkpoints_are_as_many_steps_apart_whatever_the_batch_is(search, settings, iterations):
-    words = [*search.settings_of("dribble", "mcp"), "training.minibatch_size=512", *settings]
-    assert search.interval(words) == f"checkpoint_interval={iterations}"  # 65,536 steps in batches of 16,384 and 1,024
+def test_checkpoints_are_as_many_steps_apart_whatever_the_batch_is(search, method, settings, iterations):
+    words = [*search.settings_of("dribble", method), "training.minibatch_size=512", *settings]
+    assert search.interval(words) == f"checkpoint_interval={iterations}"
+
+
+def test_a_row_of_another_commit_is_not_taken_for_that_of_a_candidate(search, tmp_path, monkeypatch):
+    table = search.Table(tmp_path / "table.csv")
+    table.write("default", 100, [], {"cpu_seconds": 60.5})
+    assert table.contains("default", 100, [], 60)
+    assert not table.contains("default", 101, [], 60)
+    for seconds in (30, 90):
+        with pytest.raises(SystemExit, match="default"):
+            table.contains("default", 100, [], seconds)
+    monkeypatch.setattr(search, "about", lambda: {"commit": "another"})
+    with pytest.raises(SystemExit, match="another commit"):
+        table.contains("default", 100, [], 60)
+
+
+def test_a_row_of_a_machine_with_other_packages_is_appended_in_the_columns_of_the_table(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    append = importlib.import_module("report").append
+    for row in ({"run": 1, "numpy": "2"}, {"run": 2, "torch": "3"}):
+        append(tmp_path / "table.csv", row)
+    assert (tmp_path / "table.csv").read_text().split() == ["run,numpy", "1,2", "2,"]
 
 
 def test_candidates_of_imitation_begin_from_the_start(search):

@@ -93,7 +93,7 @@ class Carry(Transport):
             num_envs,
             furnish=self._furnish,
             model_fields=["eq_data"],
-            episode={"taken": torch.zeros((), dtype=torch.float64)},
+            episode={"taken": torch.zeros((), dtype=torch.bool)},
             **kwargs,
         )
         self.begin_with("box", "target")
@@ -118,7 +118,7 @@ class Carry(Transport):
 
     def after_step(self, diverged: Tensor) -> None:
         """Fix the box to a carrier that touches it on the source, which sinks, and let it go over the target."""
-        touching = (self._gaps <= 0).any(-1) & (self.episode["taken"] == 0)
+        touching = (self._gaps <= 0).any(-1) & ~self.episode["taken"]
         closing = self._over(touching, self.source, RESTING_GAP)
         opening = self._over(self._joint.active == 1, self.target, RELEASE_GAP)
         if len(closing):
@@ -126,7 +126,7 @@ class Carry(Transport):
                 *(part[closing] for part in (*self._carrier.pose, *self.object.pose))
             )
             self._joint.active[closing] = 1
-            self.episode["taken"][closing] = 1
+            self.episode["taken"][closing] = True
             self.source.next_position[closing, 2] -= CLEARANCE
         self._joint.active[opening] = 0
 
@@ -146,7 +146,7 @@ class Carry(Transport):
         box.next_orientation[index] = turn
         box.next_position[index, 2] = self.source.rest[2] + HALF_SIZE
         box.next_velocity[index] = 0.0
-        self.episode["taken"][index] = 0
+        self.episode["taken"][index] = False
 
     def steer(self, goal: UserGoal) -> None:
         """See :meth:`.CharacterEnv.steer`: a box that was put down is taken again once the target moves."""
@@ -161,18 +161,18 @@ class Carry(Transport):
             "observation": state,
             "goal": self.goal(objects, ids),
             "success": self.success()[ids].unsqueeze(-1),
-            "box_taken": self.episode["taken"][ids].bool().unsqueeze(-1),
+            "box_taken": self.episode["taken"][ids].unsqueeze(-1),
         }
 
     def waypoint_seen(self, ids: Tensor | slice) -> Tensor:
         """See :func:`.carry_waypoint`."""
         com, _, box, _, target = self.motion()
-        place = carry_waypoint(com, box, target, self.episode["taken"] == 1, self._joint.active == 1)
+        place = carry_waypoint(com, box, target, self.episode["taken"], self._joint.active == 1)
         return place_seen(self, place, ids)
 
     def success(self) -> Tensor:
         """Whether the box was taken, is no longer held and stands on the target, shape ``(N,)``, bool."""
-        put_down = (self.episode["taken"] == 1) & (self._joint.active == 0)
+        put_down = self.episode["taken"] & (self._joint.active == 0)
         success = torch.zeros_like(put_down)
         success[self._over(put_down, self.target, RESTING_GAP)] = True
         return success

@@ -20,7 +20,7 @@ from torchrl_mcp.envs.tasks.objects import SceneObject
 from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import training_reward, transport_reward
-from torchrl_mcp.values import Count, Positive, Range, checked
+from torchrl_mcp.values import Count, Positive, Range, Weights, checked
 
 # Forms of the horizontal positions in a goal
 Positions = Literal["metres", "logarithmic"]
@@ -165,31 +165,23 @@ class Transport(PDCharacterEnv):
 
     def reward_of(self, *motion: Tensor) -> Tensor:
         """Reward of appendix D of a motion, as :meth:`motion` describes one, ``(N,)``."""
-        return transport_reward(
-            *motion,
-            weights=self.weights,
-            proximity_scale=self.proximity_scale,
-            speed=self.speed,
-            target_distance_power=self.target_distance_power,
-        )
+        return self._terms(motion, self.weights, self.target_distance_power)
 
     def training_reward(self) -> Tensor:
-        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`."""
+        """See :func:`~torchrl_mcp.envs.tasks.rewards.training_reward`. The distance to the target is not squared."""
         weights = self.curriculum.reward_weights
         assert weights is not None
-        reward = transport_reward(
-            *self.motion(),
+        reward = self._terms(self.motion(), weights, target_distance_power=1)
+        worth = self.curriculum.success_worth
+        return training_reward(reward, self.success(), weights=weights, speed=self.speed, worth=worth)
+
+    def _terms(self, motion: tuple[Tensor, ...], weights: Weights, target_distance_power: int) -> Tensor:
+        return transport_reward(
+            *motion,
             weights=weights,
             proximity_scale=self.proximity_scale,
             speed=self.speed,
-            target_distance_power=self.curriculum.target_distance_power,
-        )
-        return training_reward(
-            reward,
-            self.success(),
-            weights=weights,
-            speed=self.speed,
-            worth=self.curriculum.success_worth,
+            target_distance_power=target_distance_power,
         )
 
     def motion(self) -> tuple[Tensor, ...]:

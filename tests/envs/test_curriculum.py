@@ -102,7 +102,7 @@ def test_who_has_fallen_earns_neither(task):
 
 def test_standing_still_far_from_everything_earns_nothing():
     far = {"object_distances": (9.0, 10.0), "target_distances": (9.0, 10.0)}
-    state = outcomes(make(Dribble, curriculum=WEIGHED | {"target_distance_power": 2}, **far), 1, push=0.0)[0][0]
+    state = outcomes(make(Dribble, curriculum=WEIGHED, **far), 1, push=0.0)[0][0]
     assert state["reward"].abs().max() < 0.03
     assert state["task_reward"].min() > 0.1
 
@@ -138,6 +138,17 @@ def test_the_first_episodes_are_cut_short_one_by_one_and_the_next_last_as_long_a
     env = make(Heading, 4, curriculum={"random_first_length": True}, max_episode_steps=8, terminate_on_fall=False)
     assert lengths(env, 20) == [[8, 8], [6, 8], [4, 8, 8], [2, 8, 8]]
     assert lengths(make(Heading, 4, max_episode_steps=8, terminate_on_fall=False), 20) == [[8, 8]] * 4
+
+
+def test_only_a_reset_of_all_simulations_shortens_episodes():
+    env = make(Heading, 2, curriculum={"random_first_length": True}, max_episode_steps=8)
+    env.reset()
+    assert env.episode["elapsed_steps"].flatten().tolist() == [0, 4]
+    state = env.reset(env.get_state().select("qpos", "qvel"), set_state=True)  # the rest is that of a beginning
+    assert env.episode["elapsed_steps"].flatten().tolist() == [0, 0]
+    env.episode["elapsed_steps"].fill_(7)  # all episodes end in the next step
+    env.step_and_maybe_reset(state.set("action", torch.zeros(env.action_spec.shape)))
+    assert env.episode["elapsed_steps"].flatten().tolist() == [0, 0]
 
 
 def test_a_training_with_shortened_first_episodes_goes_on_at_the_same_moments_after_it_was_interrupted():

@@ -286,8 +286,8 @@ FAULTS = {
     "envs/tasks/carry.py": [
         ("        self._joint.active[opening] = 0\n", "", "envs/tasks/test_carry_success.py"),
         (
-            '(self.episode["taken"] == 1) & (self._joint.active == 0)',
-            'self.episode["taken"] == 1',
+            'self.episode["taken"] & (self._joint.active == 0)',
+            'self.episode["taken"]',
             "envs/tasks/test_carry_success.py",
         ),
     ],

@@ -325,7 +325,7 @@ class OwnEnvs(Adapter):
             the method ``render(index)`` of the environments, if there is one; it returns what :meth:`Adapter.render`
             returns.
         num_envs: Number of environments.
-        seed: int of the environments.
+        seed: Seed of the environments.
         **settings: Passed on to :class:`Adapter`.
 
     Raises:

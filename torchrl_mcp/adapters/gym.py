@@ -32,7 +32,7 @@ class GymnasiumEnvs(Adapter):
     Args:
         id: Name for ``gymnasium.make``, such as ``HalfCheetah-v5`` or ``module:name``.
         num_envs: Number N of environments.
-        seed: int of the first environment; the others have the seeds that follow.
+        seed: Seed of the first environment; the others have the seeds that follow.
         kwargs: Further arguments of ``gymnasium.make``.
         info: Names of entries of ``info`` that are metrics, such as ``is_success``.
         max_episode_steps: Steps after which an episode is ``truncated``; None for the limit of Gymnasium.

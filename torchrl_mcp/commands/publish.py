@@ -174,7 +174,7 @@ def _returns(numbers: Mapping[str, Any]) -> str:
     metrics = "".join(f", {name.replace('_', ' ')} {value:.3f}" for name, value in numbers["metrics"].items())
     value = numbers["normalised_return"]
     low, high = numbers["interval"]
-    return f"{value:.3f} ({low:.3f} to {high:.3f}), fallen {numbers['terminated']:.0%}{metrics}"
+    return f"{value:.3f} ({low:.3f} to {high:.3f}), terminated {numbers['terminated']:.0%}{metrics}"
 
 
 def _paper(path: Path, cfg: "DictConfig", origin: Mapping[str, Any]) -> str:

@@ -144,8 +144,8 @@ class Run:
 
     @property
     def curriculum_name(self) -> str | None:
-        """Choice of the group ``curriculum``, which older versions of the library called ``practice``."""
-        return self.settings.get("curriculum.name", self.settings.get("practice.name"))
+        """Choice of the group ``curriculum``."""
+        return self.settings.get("curriculum.name")
 
     @property
     def symmetry(self) -> str | None:

@@ -91,8 +91,6 @@ def _train_or_resume(plan: Plan, device: str) -> Path:
         return _train(plan)
     if changed := records.changes(folder, plan.config):
         raise ValueError(f"{folder} holds a run that differs in {', '.join(changed)}: give another run_root")
-    if is_complete(folder):
-        print(f"{folder} is complete: nothing remains to be done", flush=True)
     moves = {name: place for name, place in places.outside(plan.config).items() if Path(place).exists()}
     return _resume(folder, device, None, moves)
 
@@ -130,6 +128,7 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
     config = records.replanned(folder, total_frames, moves)
     cfg = records.located(config, folder)
     if is_complete(folder) and is_complete(folder, cfg):
+        print(f"{folder} is complete: nothing remains to be done", flush=True)
         records.store(folder, config)
         return folder
     records.require_same_character(folder, config)

@@ -113,7 +113,7 @@ def machine(device: str) -> dict[str, Any]:
         an empty text if unknown; ``cores``, the number that this process may use; ``device``, the model of the GPU or
         else ``device`` itself; and the versions of ``python``, ``torch``, ``torchrl`` and ``mujoco``.
     """
-    facts = _cpuinfo()
+    facts = processor_facts()
     flags = facts.get("flags", "").split()
     on_gpu = torch.device(device).type == "cuda"
     return {
@@ -127,7 +127,7 @@ def machine(device: str) -> dict[str, Any]:
     }
 
 
-def _cpuinfo() -> dict[str, str]:
+def processor_facts() -> dict[str, str]:
     """Return Linux's facts about the first processor, by name; empty on other systems."""
     if not CPUINFO.exists():
         return {}

@@ -165,7 +165,7 @@ class RemoteSource:
         make_env: Picklable function that makes the environments of one worker, called as
             ``make_env(num_envs=, seed=, num_threads=)``.
         num_envs: Number of environments of all workers together, ``N``.
-        seed: int of environments and exploration, from which the workers' seeds are derived.
+        seed: Seed of environments and exploration, from which the workers' seeds are derived.
         num_workers: Number of workers.
         num_threads: Number of physics threads per worker.
         backend: Backend of ``torchrl.collectors.Collector``: ``process`` on this machine, ``ray``, ``distributed``,

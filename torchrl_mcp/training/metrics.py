@@ -23,8 +23,8 @@ class EpisodeStatistics:
         num_envs: Number of environments, ``N``.
 
     Attributes:
-        steps: Steps so far in each environment. While this number is below the longest episode, only episodes that end
-            early have ended, and the mean of their returns differs from the mean of all episodes.
+        steps: Steps so far in each environment. While this number is below the longest episode, only shorter episodes
+            have ended, and the mean of their returns differs from the mean of all episodes.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -53,8 +53,8 @@ class EpisodeStatistics:
         return {"steps": self.steps, "returns": self.returns, "lengths": self.lengths}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`state_dict`; the states of older versions lack the steps."""
-        self.steps = state.get("steps", math.inf)
+        """Restore the result of :meth:`state_dict`."""
+        self.steps = state["steps"]
         self.returns = state["returns"].clone()
         self.lengths = state["lengths"].clone()
 

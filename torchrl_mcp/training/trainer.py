@@ -1,5 +1,6 @@
 """The training loop, which is the same for every method: collect, learn, record."""
 
+import math
 import time
 from pathlib import Path
 from typing import Any, cast
@@ -83,8 +84,8 @@ class Trainer:
             with TrainingBar(settings.total_frames, self.progress.frames, shown=self.progress_bar) as bar:
                 while self.progress.frames < settings.total_frames:
                     metrics = self.iterate()
-                    ended = metrics["episode/count"] > 0
-                    bar.advance(settings.frames_per_batch, f"return {metrics[NORMALISED_RETURN]:.3f}" if ended else "")
+                    mean = metrics[NORMALISED_RETURN]
+                    bar.advance(settings.frames_per_batch, f"return {mean:.3f}" if math.isfinite(mean) else "")
         finally:
             self.source.stop()
 
@@ -166,7 +167,7 @@ class Trainer:
 
     def _episode_metrics(self, batch: TensorDictBase) -> dict[str, float]:
         returns, lengths = self.episodes.update(batch)
-        if self.episodes.steps < self.source.env.max_episode_steps:  # so far, only episodes with a fall have ended
+        if self.episodes.steps < self.source.env.max_episode_steps:  # so far, only shorter episodes have ended
             returns = returns.new_empty(0)
         return {
             "episode/count": len(lengths),
