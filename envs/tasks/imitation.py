@@ -24,13 +24,10 @@ from torchrl_mcp.envs.tasks.imitation_reward import (
     squared_angles,
     squared_distances,
 )
-from torchrl_mcp.values import Count, Period, Positive, Share, checked
+from torchrl_mcp.values import Count, Period, Positive, checked
 
 NUM_TARGETS = 2
 """Number of future states of the reference in the goal (section 4)."""
-
-REMEMBERED = 0.999
-"""Share of the counts of failures and steps that a control step keeps."""
 
 # Clips to which the reference may jump
 Switch = Literal["any", "same"]
@@ -85,8 +82,6 @@ class Imitation(PDCharacterEnv):
             drifted away because it does not observe the reference.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` ends the episode; ``"switch"``
             changes to another reference, so that every episode lasts until its time limit or a failure.
-        failed_clips: Share of the random moments that are drawn from clips in proportion to how often characters have
-            failed in them lately, so that hard clips are practised more.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -122,7 +117,6 @@ class Imitation(PDCharacterEnv):
         switch_candidates: Count = 1,
         switch_to: Switch = "any",
         clip_end: ClipEnd = "truncate",
-        failed_clips: Share = 0.0,
         max_episode_steps: Count = 300,
         **kwargs: Any,
     ) -> None:
@@ -156,9 +150,6 @@ class Imitation(PDCharacterEnv):
         )
         self.goal_layout = bodies_layout([f"step_{step + 1}.{name}" for step in range(NUM_TARGETS) for name in names])
         self.library = library.to(self.device)
-        self.failed_clips = failed_clips
-        self._failures = torch.ones(len(library), dtype=torch.float64, device=self.device)  # steps with a failure
-        self._practised = torch.ones_like(self._failures)  # steps
         self._layout = joint_layout(character).to(self.device)
         self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
         ahead = CONTROL_TIMESTEP * torch.arange(1, NUM_TARGETS + 1, dtype=torch.float64)
@@ -207,8 +198,7 @@ class Imitation(PDCharacterEnv):
 
     def get_extra_state(self) -> dict[str, Any]:
         """See :meth:`CharacterEnv.get_extra_state`; adds a digest of the motions."""
-        practice = {"failures": self._failures, "practised": self._practised}
-        return {**super().get_extra_state(), "motions": self.library.digest, **practice}
+        return {**super().get_extra_state(), "motions": self.library.digest}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore a result of :meth:`get_extra_state`.
@@ -222,8 +212,6 @@ class Imitation(PDCharacterEnv):
                 "begin another from it with stage=pretrain pretrained=<folder>"
             )
         super().set_extra_state(state)
-        self._failures.copy_(state["failures"])
-        self._practised.copy_(state["practised"])
 
     def initial_state(self, num: int) -> dict[str, Tensor]:
         """The state of the reference at random moments."""
@@ -234,19 +222,7 @@ class Imitation(PDCharacterEnv):
         if clips is not None:
             shares = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
             return clips, shares * self.library.durations[clips]
-        return self.library.sample(num, self.generator, self._weights() if self.failed_clips else None)
-
-    def _weights(self) -> Tensor:
-        """Probabilities of clips, of which ``failed_clips`` follows the share of steps with a failure."""
-        failing = self.library.weights * self._failures / self._practised
-        usual = self.library.weights / self.library.weights.sum()
-        return (1 - self.failed_clips) * usual + self.failed_clips * failing / failing.sum()
-
-    def _count_failures(self) -> None:
-        """Count failures and steps of each clip, and forget old ones."""
-        clips = self.episode["clip"]
-        self._failures.mul_(REMEMBERED).index_add_(0, clips, (self.fallen() | self.terminated()).double())
-        self._practised.mul_(REMEMBERED).index_add_(0, clips, torch.ones_like(self.episode["time"]))
+        return self.library.sample(num, self.generator)
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
@@ -300,8 +276,6 @@ class Imitation(PDCharacterEnv):
 
     def update_goal(self) -> None:
         """Let the reference go on, and change some of them."""
-        if self.failed_clips:
-            self._count_failures()
         self.episode["time"] += CONTROL_TIMESTEP
         self._switch()
 
