@@ -187,20 +187,17 @@ class MotionLibrary:
         motion = PlacedMotion(state, looped)
         return motion if placement is None else motion.carried(placement)
 
-    def sample(
-        self, num: int, generator: torch.Generator, weights: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def sample(self, num: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Draw moments: clips by their weights, times uniformly over a clip or one cycle.
 
         Args:
             num: Number of moments.
             generator: Source of randomness.
-            weights: Relative probabilities of the clips in place of the library's, ``(len(library),)``.
 
         Returns:
             Clips, shape ``(num,)``, int64, and times in seconds, shape ``(num,)``, float64.
         """
-        clips = torch.multinomial(self.weights if weights is None else weights, num, replacement=True, generator=generator)
+        clips = torch.multinomial(self.weights, num, replacement=True, generator=generator)
         durations = self.durations[clips]
         return clips, torch.rand(num, generator=generator, dtype=torch.float64, device=durations.device) * durations
 

@@ -32,6 +32,9 @@ NUM_TARGETS = 2
 REMEMBERED = 0.999
 """Share of the counts of failures and steps that a control step keeps."""
 
+LEAD = 1.0
+"""Seconds before a hard second of a clip in which practice may begin."""
+
 # Clips to which the reference may jump
 Switch = Literal["any", "same"]
 
@@ -85,8 +88,8 @@ class Imitation(PDCharacterEnv):
             drifted away because it does not observe the reference.
         clip_end: What happens at the end of a clip that does not loop: ``"truncate"`` ends the episode; ``"switch"``
             changes to another reference, so that every episode lasts until its time limit or a failure.
-        failed_clips: Share of the random moments that are drawn from clips in proportion to how often characters have
-            failed in them lately, so that hard clips are practised more.
+        failed_moments: Share of the random moments that are drawn shortly before moments at which characters have
+            failed lately, in proportion to how often they did, so that hard motions are practised more.
         max_episode_steps: Actions of 1/30 s until an episode is ``truncated``.
         **kwargs: Passed on to :class:`~torchrl_mcp.envs.pd_character.PDCharacterEnv`.
 
@@ -122,7 +125,7 @@ class Imitation(PDCharacterEnv):
         switch_candidates: Count = 1,
         switch_to: Switch = "any",
         clip_end: ClipEnd = "truncate",
-        failed_clips: Share = 0.0,
+        failed_moments: Share = 0.0,
         max_episode_steps: Count = 300,
         **kwargs: Any,
     ) -> None:
@@ -156,8 +159,10 @@ class Imitation(PDCharacterEnv):
         )
         self.goal_layout = bodies_layout([f"step_{step + 1}.{name}" for step in range(NUM_TARGETS) for name in names])
         self.library = library.to(self.device)
-        self.failed_clips = failed_clips
-        self._failures = torch.ones(len(library), dtype=torch.float64, device=self.device)  # steps with a failure
+        self.failed_moments = failed_moments
+        seconds = library.durations.ceil().long().to(self.device)
+        self._first_second = seconds.cumsum(0) - seconds  # of each clip, in the counts
+        self._failures = torch.ones(int(seconds.sum()), dtype=torch.float64, device=self.device)  # by second of a clip
         self._practised = torch.ones_like(self._failures)  # steps
         self._layout = joint_layout(character).to(self.device)
         self._keys = torch.tensor([names.index(body) for body in CHARACTERS[character].key_bodies], device=self.device)
@@ -234,19 +239,29 @@ class Imitation(PDCharacterEnv):
         if clips is not None:
             shares = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
             return clips, shares * self.library.durations[clips]
-        return self.library.sample(num, self.generator, self._weights() if self.failed_clips else None)
+        clips, times = self.library.sample(num, self.generator)
+        if self.failed_moments:
+            hard = torch.rand(num, generator=self.generator, device=self.device) < self.failed_moments
+            clips[hard], times[hard] = self._hard_moments(int(hard.sum()))
+        return clips, times
 
-    def _weights(self) -> Tensor:
-        """Probabilities of clips, of which ``failed_clips`` follows the share of steps with a failure."""
-        failing = self.library.weights * self._failures / self._practised
-        usual = self.library.weights / self.library.weights.sum()
-        return (1 - self.failed_clips) * usual + self.failed_clips * failing / failing.sum()
+    def _hard_moments(self, num: int) -> tuple[Tensor, Tensor]:
+        """Draw moments up to a second before seconds of clips, in proportion to failures per step in these seconds."""
+        if not num:
+            return self._everybody[:0], self.episode["time"][:0]
+        seconds = torch.multinomial(self._failures / self._practised, num, replacement=True, generator=self.generator)
+        clips = torch.searchsorted(self._first_second, seconds, right=True) - 1
+        start = (seconds - self._first_second[clips]).double() - LEAD
+        drawn = torch.rand(num, generator=self.generator, dtype=torch.float64, device=self.device)
+        return clips, (start + (1 + LEAD) * drawn).clamp_min(0.0).minimum(self.library.durations[clips])
 
     def _count_failures(self) -> None:
-        """Count failures and steps of each clip, and forget old ones."""
+        """Count failures and steps in each second of each clip, and forget old ones."""
         clips = self.episode["clip"]
-        self._failures.mul_(REMEMBERED).index_add_(0, clips, (self.fallen() | self.terminated()).double())
-        self._practised.mul_(REMEMBERED).index_add_(0, clips, torch.ones_like(self.episode["time"]))
+        time = self.episode["time"] % self.library.durations[clips]
+        seconds = self._first_second[clips] + time.long()
+        self._failures.mul_(REMEMBERED).index_add_(0, seconds, (self.fallen() | self.terminated()).double())
+        self._practised.mul_(REMEMBERED).index_add_(0, seconds, torch.ones_like(time))
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""
@@ -300,7 +315,7 @@ class Imitation(PDCharacterEnv):
 
     def update_goal(self) -> None:
         """Let the reference go on, and change some of them."""
-        if self.failed_clips:
+        if self.failed_moments:
             self._count_failures()
         self.episode["time"] += CONTROL_TIMESTEP
         self._switch()
