@@ -250,6 +250,30 @@ def test_checkpoints_are_evaluated_after_numbers_of_steps_and_only_once(command,
     assert output.read_text() == first
 
 
+def test_every_episode_of_a_transport_task_has_one_outcome(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    outcomes = runpy.run_path(str(BENCHMARKS / "failures.py"))["outcomes"]
+    steps = torch.arange(1.0, 13.0)  # a step per second
+    away = [steps, 3 + steps, steps, 0.9 - 0.001 * steps, 1.1 + 0 * steps, 0.5 + 0.2 * (steps % 2)]
+    lengths = torch.tensor([12, 5, 6, 12, 12, 12])
+    success = torch.tensor([True, False, False, False, False, False])
+    found = outcomes(success, lengths, torch.stack(away, 1), timestep=1.0)
+    chosen = {name: flags.nonzero().flatten().tolist() for name, flags in found.items()}
+    expected = {"success": [0], "falls at the start": [1], "falls later": [2], "stops short": [3], "other": [4, 5]}
+    assert chosen == expected
+
+
+def test_failures_of_a_run_are_counted(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    main = runpy.run_path(str(BENCHMARKS / "failures.py"))["main"]
+    network = str(builtin("mcp", "biped", "dribble"))
+    monkeypatch.setattr(sys, "argv", ["failures.py", network, "--episodes", "4"])
+    main()
+    shares = [int(cell[:-1]) for cell in capsys.readouterr().out.split() if cell.endswith("%")]
+    assert len(shares) == 5
+    assert sum(shares) == 100
+
+
 def test_two_searches_that_share_a_table_keep_each_other_s_rows(search, tmp_path):
     tables = [search.Table(tmp_path / "table.csv") for _ in range(2)]
     for name, table in zip(("first", "second"), tables, strict=True):
