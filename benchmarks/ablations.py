@@ -11,9 +11,10 @@ each variant of MCP.
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
-from archive import EMPTY, archived, average, label, score, write_tables
+from archive import EMPTY, archived, label, score, write_tables
 
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.runs.tables import text_table
@@ -71,7 +72,7 @@ def order(variant: tuple[Any, ...]) -> tuple[Any, ...]:
 
 def completed(cell: Cell) -> str:
     """Return the share of episodes of imitation in which the character follows its references to the end."""
-    return f"{1 - average([run.evaluation['deterministic']['terminated'] for run in cell.complete]):.0%}"
+    return f"{1 - fmean([run.evaluation['deterministic']['terminated'] for run in cell.complete]):.0%}"
 
 
 if __name__ == "__main__":

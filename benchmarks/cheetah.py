@@ -10,9 +10,10 @@ command, the commit and the machine of every run, and the archive ``runs.tar.xz`
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
-from archive import EMPTY, archived, average, learning_curve, rows
+from archive import EMPTY, archived, learning_curve, rows
 from report import write
 
 from torchrl_mcp.analysis.curves import draw_curves
@@ -44,7 +45,7 @@ def line(cell: Cell, groups: Sequence[Cell]) -> dict[str, Any]:
         "steps": f"{cell.steps:,}",
         "at the seven speeds": mean_and_deviation(before[0]) if before else EMPTY,
         "at the new speeds": mean_and_deviation(cell),
-        "exploring": f"{average(cell.returns('stochastic')):.3f}",
+        "exploring": f"{fmean(cell.returns('stochastic')):.3f}",
         "error of the speed": f"{cell.metrics['speed_error']:.2f} m/s",
         "seeds": len(cell.by_seed),
     }
@@ -52,7 +53,7 @@ def line(cell: Cell, groups: Sequence[Cell]) -> dict[str, Any]:
 
 def mean_and_deviation(cell: Cell) -> str:
     """Return the mean deterministic return of a cell and its standard deviation over seeds."""
-    return f"{average(cell.returns()):.3f} ± {cell.deviation():.3f}"
+    return f"{fmean(cell.returns()):.3f} ± {cell.deviation():.3f}"
 
 
 if __name__ == "__main__":
