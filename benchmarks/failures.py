@@ -16,11 +16,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import torch
 from report import table
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_mcp.envs.tasks.transport import Transport
+from torchrl_mcp.evaluation.rollout import Evaluation, evaluate
 from torchrl_mcp.runs import policies
 from torchrl_mcp.training import checkpoint
 
@@ -34,23 +34,24 @@ STILL = 0.1
 """Largest change of this distance in metres of an object that lies still."""
 
 
-def outcomes(success: Tensor, lengths: Tensor, distances: Tensor, timestep: float) -> dict[str, Tensor]:
+def outcomes(played: Evaluation, distances: Tensor, timestep: float) -> dict[str, Tensor]:
     """Return which of N episodes have each outcome, each ``(N,)``, bool; an episode has exactly one outcome.
 
     Args:
-        success: Whether the episode had a success, ``(N,)``.
-        lengths: Steps until a fall, or all steps, ``(N,)``.
-        distances: Distance between object and target in metres after each of T steps, ``(T, N)``.
+        played: The episodes, with the metric ``success``.
+        distances: Distance between object and target in metres after each of T steps, ``(T, N)``, and NaN from the end
+            of an episode on.
         timestep: Seconds per step.
     """
-    steps = round(START / timestep)
-    last = distances[-steps:]
-    fell = lengths < len(distances)
-    short = (last.max(0).values < NEAR) & (last.max(0).values - last.min(0).values < STILL)
+    success = played.metrics["success"] > 0
+    early = played.lengths <= round(START / timestep)
+    fell = played.terminated
+    last = distances[-round(START / timestep) : -1]  # the last step ends all episodes
+    short = (last.amax(0) < NEAR) & (last.amax(0) - last.amin(0) < STILL)
     return {
         "success": success,
-        "falls at the start": ~success & fell & (lengths <= steps),
-        "falls later": ~success & fell & (lengths > steps),
+        "falls at the start": ~success & fell & early,
+        "falls later": ~success & fell & ~early,
         "stops short": ~success & ~fell & short,
         "other": ~success & ~fell & ~short,
     }
@@ -60,21 +61,11 @@ def play(path: Path, *, episodes: int, seed: int) -> dict[str, Tensor]:
     """Play one deterministic episode in each of N environments, and return the outcomes."""
     evaluation = policies.policy_config(checkpoint.find(path)).evaluation
     _, agent, env = policies.restore(path, num_envs=episodes, seed=seed, **evaluation.environment)
-    if not hasattr(env, "target"):
+    if not isinstance(env, Transport):
         raise SystemExit(f"{path} is not a run of carry or dribble: give one")
-    success = torch.zeros(episodes, dtype=torch.bool)
-    lengths = torch.full((episodes,), env.max_episode_steps)
-    distances = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        state = env.reset()
-        for step in range(1, env.max_episode_steps + 1):
-            outcome = env.step(agent.actor.policy(state))["next"]
-            fell = outcome["terminated"].squeeze(-1) & (lengths == env.max_episode_steps)
-            lengths[fell] = step
-            success |= outcome["success"].squeeze(-1) & (lengths >= step)
-            distances.append(torch.linalg.vector_norm((env.object.position - env.target.position)[:, :2], dim=-1))
-            state = outcome.exclude("reward", "done", "terminated", "truncated")
-    return outcomes(success, lengths, torch.stack(distances), env.control_timestep)
+    played = evaluate(agent.actor.policy, env, positions=lambda: env.object.position - env.target.position)
+    assert played.positions is not None
+    return outcomes(played, played.positions[..., :2].norm(dim=-1), env.control_timestep)
 
 
 def main() -> None:

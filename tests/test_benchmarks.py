@@ -13,9 +13,9 @@ import torch
 
 from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Heading
+from torchrl_mcp.evaluation.rollout import Evaluation
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import builtin
-from torchrl_mcp.runs.configuration import compose_run
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ABOUT = {"commit", "date", "processor", "instructions", "cores", "python", "torch", "torchrl", "mujoco", "threads"}
@@ -190,38 +190,6 @@ def test_learners_are_drawn_that_have_rows(monkeypatch):
     assert [[line.get_label() for line in axes.lines] for axes in draw(rows).axes] == [["SAC"]] * 2
 
 
-@pytest.fixture
-def search(monkeypatch):
-    """The search of settings, which needs Optuna only to propose them."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    monkeypatch.delitem(sys.modules, "search", raising=False)
-    return importlib.import_module("search")
-
-
-def test_a_candidate_is_trained_for_its_cpu_seconds_evaluated_and_not_trained_again(
-    search, command, tmp_path, monkeypatch
-):
-    cpu_time = sys.modules["cpu_time"]
-    monkeypatch.setattr(
-        cpu_time.subprocess, "run", lambda words, **_: command("evaluate", *words[1:])
-    )  # no new process
-    tiny = "preset=smoke training.frames_per_batch=128 task.evaluation.max_episode_steps=10"
-    monkeypatch.setattr(cpu_time, "EPISODES", "4")
-    monkeypatch.setattr(search, "STEPS_PER_CHECKPOINT", 128)
-    words = ["heading", "scratch", "--minutes", "0.05", "--seeds", "7", "--candidate", f"tiny={tiny}"]
-    for _ in range(2):
-        search.main([*words, "--root", str(tmp_path), "--results", str(tmp_path)])
-    with (tmp_path / "heading-scratch-candidates.csv").open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    assert (row["trial"], row["seed"], row["settings"]) == ("tiny", "7", tiny)
-    assert float(row["cpu_seconds"]) >= 3.0
-    assert int(row["steps"]) > 0
-    returns = [float(row[f"{mode}_return"]) for mode in ("deterministic", "stochastic")]
-    assert float(row["score"]) == pytest.approx(sum(returns) / 2)
-    with pytest.raises(SystemExit, match="tiny"):
-        search.main([*words[:3], "1", *words[4:], "--root", str(tmp_path), "--results", str(tmp_path)])
-
-
 def test_checkpoints_are_evaluated_after_numbers_of_steps_and_only_once(command, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     budgets = importlib.import_module("budgets")
@@ -254,10 +222,14 @@ def test_every_episode_of_a_transport_task_has_one_outcome(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     outcomes = runpy.run_path(str(BENCHMARKS / "failures.py"))["outcomes"]
     steps = torch.arange(1.0, 13.0)  # a step per second
-    away = [steps, 3 + steps, steps, 0.9 - 0.001 * steps, 1.1 + 0 * steps, 0.5 + 0.2 * (steps % 2)]
-    lengths = torch.tensor([12, 5, 6, 12, 12, 12])
-    success = torch.tensor([True, False, False, False, False, False])
-    found = outcomes(success, lengths, torch.stack(away, 1), timestep=1.0)
+    distances = [steps, 3 + steps, steps, 0.9 - 0.001 * steps, 1.1 + 0 * steps, 0.5 + 0.2 * (steps % 2)]
+    played = Evaluation(
+        returns=torch.zeros(6),
+        lengths=torch.tensor([12, 5, 6, 12, 12, 12]),
+        terminated=torch.tensor([False, True, True, False, False, False]),
+        metrics={"success": torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])},
+    )
+    found = outcomes(played, torch.stack(distances, 1), timestep=1.0)
     chosen = {name: flags.nonzero().flatten().tolist() for name, flags in found.items()}
     expected = {"success": [0], "falls at the start": [1], "falls later": [2], "stops short": [3], "other": [4, 5]}
     assert chosen == expected
@@ -272,61 +244,6 @@ def test_failures_of_a_run_are_counted(monkeypatch, capsys):
     shares = [int(cell[:-1]) for cell in capsys.readouterr().out.split() if cell.endswith("%")]
     assert len(shares) == 5
     assert sum(shares) == 100
-
-
-def test_two_searches_that_share_a_table_keep_each_other_s_rows(search, tmp_path):
-    tables = [search.Table(tmp_path / "table.csv") for _ in range(2)]
-    for name, table in zip(("first", "second"), tables, strict=True):
-        table.write(name, 100, [], {"cpu_seconds": 60.0, "score": 1.0})
-    assert [row["trial"] for row in tables[0].rows] == ["first", "second"]
-
-
-def test_every_method_is_searched_over_settings_that_it_has(search):
-    for method, noises in search.NOISE.items():
-        for settings in noises.values():
-            words = [*search.settings_of("dribble", method), *sys.modules["cpu_time"].FIXED, *settings.split()]
-            compose_run(*words, *search.batch_words(32, 1024, minibatches=8, passes=4), "stage.gamma=0.995")
-
-
-@pytest.mark.parametrize(
-    ("method", "settings", "iterations"),
-    [
-        ("mcp", [], 4),  # 65,536 steps in batches of 16,384
-        ("mcp", ["training.num_envs=32", "training.frames_per_batch=1024"], 64),
-        ("hierarchical", [], 2),  # its batches have eight times 4,096 steps
-    ],
-)
-def test_checkpoints_are_as_many_steps_apart_whatever_the_batch_is(search, method, settings, iterations):
-    words = [*search.settings_of("dribble", method), "training.minibatch_size=512", *settings]
-    assert search.interval(words) == f"checkpoint_interval={iterations}"
-
-
-def test_a_row_of_another_commit_is_not_taken_for_that_of_a_candidate(search, tmp_path, monkeypatch):
-    table = search.Table(tmp_path / "table.csv")
-    table.write("default", 100, [], {"cpu_seconds": 60.5})
-    assert table.contains("default", 100, [], 60)
-    assert not table.contains("default", 101, [], 60)
-    for seconds in (30, 90):
-        with pytest.raises(SystemExit, match="default"):
-            table.contains("default", 100, [], seconds)
-    monkeypatch.setattr(search, "about", lambda: {"commit": "another"})
-    with pytest.raises(SystemExit, match="another commit"):
-        table.contains("default", 100, [], 60)
-
-
-def test_a_row_of_a_machine_with_other_packages_is_appended_in_the_columns_of_the_table(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    append = importlib.import_module("report").append
-    for row in ({"run": 1, "numpy": "2"}, {"run": 2, "torch": "3"}):
-        append(tmp_path / "table.csv", row)
-    assert (tmp_path / "table.csv").read_text().split() == ["run,numpy", "1,2", "2,"]
-
-
-def test_candidates_of_imitation_begin_from_the_start(search):
-    cfg = compose_run(*search.settings_of("imitation", "mcp"))
-    assert (cfg.stage.name, cfg.pretrained) == ("pretrain", None)
-    with pytest.raises(SystemExit):
-        search.main(["imitation", "mcp", "--minutes", "1"])
 
 
 def test_the_gates_of_soft_actor_critic_play_the_composite_of_the_frozen_primitives(monkeypatch):
