@@ -178,7 +178,7 @@ def line(cell: Cell) -> dict[str, Any]:
         facts["completed"] = f"{1 - ended:.0%}"
         facts["tracking error"] = f"{cell.metrics['tracking_error']:.3f} m"
     else:
-        facts["place"] = f"{cell.reach['place']:.2f}" if cell.reach else EMPTY
+        facts["skill"] = f"{cell.reach['skill']:.2f}" if cell.reach else EMPTY
         facts["paper"] = f"{cell.reported.mean:.3f} ± {cell.reported.std:.3f}" if cell.reported else EMPTY
     return facts
 
@@ -247,7 +247,7 @@ def rows(cell: Cell, run: Run) -> Iterator[dict[str, Any]]:
             "mode": mode,
             **{key: numbers[key] for key in ("normalised_return", "interval", "return", "length", "terminated")},
             "success": numbers["metrics"].get("success", EMPTY),
-            "place": numbers.get("reach", {}).get("place", EMPTY),
+            "skill": numbers.get("reach", {}).get("skill", EMPTY),
             "success_return": numbers.get("success_return", EMPTY),
             "episodes": numbers["episodes"],
             "seconds": round(run.seconds),

@@ -63,7 +63,7 @@ def evaluate(runs: Sequence[Run], rows: list[dict[str, Any]], *, episodes: int) 
                     "steps": frames(checkpoint),
                     "mode": mode,
                     "success": numbers["metrics"]["success"],
-                    "place": numbers["reach"]["place"],
+                    "skill": numbers["reach"]["skill"],
                     **{key: numbers[key] for key in ("normalised_return", "success_return", "terminated", "episodes")},
                     "run_commit": run.commit,
                     **about(),

@@ -82,15 +82,15 @@ def summary(groups: Sequence[Cell]) -> Iterator[dict[str, Any]]:
 
 
 def brief(cell: Cell | None) -> str:
-    """Return the mean deterministic return, after the share of successes and the place if the task defines success."""
+    """Return the mean deterministic return, after the share of successes and the skill if the task defines success."""
     if cell is None:
         return EMPTY
     return f"{successes(cell)} ({average(cell):.3f})" if share(cell) else f"{average(cell):.3f}"
 
 
 def successes(cell: Cell) -> str:
-    """Return the share of successful episodes, and the place between standing still and an ideal player."""
-    return f"{share(cell)}, place {cell.reach['place']:.2f}"
+    """Return the share of successful episodes and the skill: 0 for standing still, 1 for an ideal player."""
+    return f"{share(cell)}, skill {cell.reach['skill']:.2f}"
 
 
 def row_title(place: tuple[str, str]) -> str:

@@ -227,12 +227,12 @@ def test_the_statistics_of_four_episodes_by_hand():
     )
 
 
-def test_the_place_of_returns_lies_between_those_of_standing_still_and_an_ideal_player():
+def test_the_skill_of_returns_lies_between_those_of_standing_still_and_an_ideal_player():
     outcome = replace(
         episodes([1.0, 2.0], [1, 2], [True, False]), reach=Reach(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 3.0]))
     )
     numbers = episode_statistics(outcome, lambda returns: returns / 10)
-    assert numbers["reach"] == pytest.approx({"place": (1.5 - 0.5) / (3.5 - 0.5), "standing": 0.05, "ideal": 0.35})
+    assert numbers["reach"] == pytest.approx({"skill": (1.5 - 0.5) / (3.5 - 0.5), "standing": 0.05, "ideal": 0.35})
 
 
 def test_an_ant_that_does_nothing_is_where_standing_still_is():
@@ -241,7 +241,7 @@ def test_an_ant_that_does_nothing_is_where_standing_still_is():
     numbers = episode_statistics(evaluate(idle, env), env.normalised_return)
     assert numbers["reach"]["standing"] == pytest.approx(1 / 6)
     assert numbers["reach"]["ideal"] == 1
-    assert numbers["reach"]["place"] == pytest.approx(0, abs=0.03)
+    assert numbers["reach"]["skill"] == pytest.approx(0, abs=0.03)
 
 
 def test_the_interval_is_that_of_normal_theory_for_many_episodes():

@@ -335,16 +335,16 @@ def test_pretrainings_of_other_lengths_are_told_apart(tmp_path, run_writers, mon
     assert names == ["MCP, pre-trained 3 M", "MCP, pre-trained 10 M"]
 
 
-def place_in(title, score):
-    """The place of the method with a return, in the table of a row such as ``dribble, T-Rex``."""
+def skill_in(title, score):
+    """The skill of the method with a return, in the table of a row such as ``dribble, T-Rex``."""
     name = title.lower().replace(", ", "_").replace("-", "")
     head, *rows = cells_of((PUBLISHED / f"table2/{name}.md").read_text())
-    (place,) = {row[head.index("place")] for row in rows if row[head.index("deterministic")].startswith(f"{score} ")}
-    return place
+    (skill,) = {row[head.index("skill")] for row in rows if row[head.index("deterministic")].startswith(f"{score} ")}
+    return skill
 
 
 def test_the_readme_has_the_short_form_of_table_2():
-    """Its cells are those of the long form, with places: MCP, the best of the others that pre-train, and scratch."""
+    """Its cells are those of the long form, with skills: MCP, the best of the others that pre-train, and scratch."""
     summary = (PUBLISHED / "table2/summary.md").read_text()
     assert summary in (ROOT / "README.md").read_text()
     head, *rows = cells_of(summary)
@@ -357,7 +357,7 @@ def test_the_readme_has_the_short_form_of_table_2():
         best = max(others, key=lambda name: float(others[name][:5]))
         expected = [(name, re.match(r"([\d.]+)(?:, (\d+%))? \((\d)\)", row[name])) for name in ("MCP", best, "Scratch")]
         cells = [
-            f"{found[2]}, place {place_in(row[''], found[1])} ({found[1]})" if found[2] else found[1]
+            f"{found[2]}, skill {skill_in(row[''], found[1])} ({found[1]})" if found[2] else found[1]
             for _, found in expected
         ]
         cells[1] = f"{best} {cells[1]}"

@@ -202,13 +202,13 @@ def test_the_place_between_standing_still_and_the_ideal_is_averaged_over_seeds(w
     folders = [write_run(str(seed), seed=seed, task="dribble", score=0.5) for seed in range(2)]
     (without,) = grouped(*folders)
     assert without.reach == {}
-    for folder, place in zip(folders, (0.5, 0.7), strict=True):
+    for folder, skill in zip(folders, (0.5, 0.7), strict=True):
         found = json.loads((folder / "evaluation.json").read_text())
-        found["deterministic"]["reach"] = {"place": place, "standing": 0.2, "ideal": 0.6}
+        found["deterministic"]["reach"] = {"skill": skill, "standing": 0.2, "ideal": 0.6}
         (folder / "evaluation.json").write_text(json.dumps(found))
     (cell,) = grouped(*folders)
     assert len(cell.complete) == 2
-    assert cell.reach == pytest.approx({"place": 0.6, "standing": 0.2, "ideal": 0.6})
+    assert cell.reach == pytest.approx({"skill": 0.6, "standing": 0.2, "ideal": 0.6})
 
 
 def test_metrics_are_means_over_seeds_of_deterministic_episodes_without_terms_of_the_reward(write_run):

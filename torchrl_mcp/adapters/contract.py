@@ -26,8 +26,8 @@ class Reach(NamedTuple):
     standing: Tensor
     ideal: Tensor
 
-    def place(self, returns: Tensor) -> Tensor:
-        """Mean position of returns between the two returns, ``()``: 0 for standing still, 1 for the ideal player."""
+    def skill(self, returns: Tensor) -> Tensor:
+        """Skill score of the mean of returns, ``()``: 0 for standing still, 1 for the ideal player."""
         standing = self.standing.mean()
         return (returns.mean() - standing) / (self.ideal.mean() - standing)
 

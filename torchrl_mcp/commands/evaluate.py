@@ -62,7 +62,7 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
         )
         if reach := numbers.get("reach"):
             print(
-                f"    {round(100 * reach['place'])}% of the way from standing still ({reach['standing']:.3f}) "
+                f"    {round(100 * reach['skill'])}% of the way from standing still ({reach['standing']:.3f}) "
                 f"to an ideal player ({reach['ideal']:.3f})"
             )
         if "success_return" in numbers:

@@ -154,7 +154,7 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
         fraction, ``metrics``, and ``durations`` of flags in control steps. ``normalised_return_std`` is the standard
         deviation over episodes, and ``interval`` the 95 % percentile bootstrap interval of the mean of the normalised
         return; both are 0 wide for a single episode. ``reach``, which some tasks have, contains the returns of
-        ``standing`` and of an ``ideal`` player, and ``place``, which is 0 at the former and 1 at the latter.
+        ``standing`` and of an ``ideal`` player, and ``skill``, which is 0 at the former and 1 at the latter.
         ``success_return``, which tasks with a metric ``success`` have, is the normalised return with the reward 1 in
         every step with a success.
         ``episodes`` is the number of episodes.
@@ -165,7 +165,7 @@ def episode_statistics(outcome: Evaluation, normalised_return: Callable[[Tensor]
     reach = {}
     if outcome.reach is not None:
         ends = {name: normalised_return(returns).mean().item() for name, returns in outcome.reach._asdict().items()}
-        reach = {"reach": {"place": outcome.reach.place(outcome.returns).item(), **ends}}
+        reach = {"reach": {"skill": outcome.reach.skill(outcome.returns).item(), **ends}}
     success_return = {}
     if outcome.success_returns is not None:
         success_return = {"success_return": normalised_return(outcome.success_returns).mean().item()}

@@ -158,7 +158,7 @@ class Cell:
 
     @property
     def reach(self) -> dict[str, float]:
-        """Means over seeds of ``place``, ``standing`` and ``ideal`` of deterministic episodes; empty for some tasks."""
+        """Means over seeds of ``skill``, ``standing`` and ``ideal`` of deterministic episodes; empty for some tasks."""
         return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
 
     @property

@@ -52,7 +52,7 @@ def _returns(folder: Path) -> list[str]:
     if reach := modes["deterministic"].get("reach"):
         standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
         values.insert(
-            1, f"{round(100 * reach['place'])}% of the way from standing still ({standing}) to the ideal ({ideal})"
+            1, f"{round(100 * reach['skill'])}% of the way from standing still ({standing}) to the ideal ({ideal})"
         )
     return [episodes, *(f"  {value}" for value in [*values, *_paper(folder)])]
 
