@@ -49,7 +49,7 @@ def section(parser: argparse.ArgumentParser, heading: str) -> Iterator[str]:
         if isinstance(action, argparse._SubParsersAction):
             helps = {choice.dest: choice.help for choice in action._choices_actions}
             for command, subparser in action.choices.items():
-                subparser.description = subparser.description or f"{helps[command].capitalize()}."
+                subparser.description = subparser.description or f"{helps[command][:1].upper()}{helps[command][1:]}."
                 yield from section(subparser, f"### {parser.prog} {command}")
 
 
@@ -70,4 +70,4 @@ def name(action: argparse.Action) -> str:
 def meaning(action: argparse.Action) -> str:
     """Return the help of an argument for a cell of a table."""
     text = ((action.help or "") % vars(action)).replace("|", r"\|")
-    return re.sub(r"(?<![`\w/])(--?[a-z][a-z-]*)", r"`\1`", text)
+    return re.sub(r"(?<![`\w/])(--?[a-z][a-z-]*(?:=[\w-]+| \w+=\w+)?)", r"`\1`", text)

@@ -57,27 +57,34 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser(PROGRAM, description, EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="command")
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument(
-        "checkpoints", nargs="+", metavar="CHECKPOINT", help="run folder, checkpoint file or builtin:CHARACTER"
-    )
     shared.add_argument("--output", type=Path, default=Path("figures"), help="folder to write to (default %(default)s)")
     add_trust(shared)
     shared.add_argument("--seed", type=seed, default=0, help="seed of random numbers (default %(default)s)")
 
-    command = commands.add_parser("curves", parents=[shared], help="draw learning curves of several runs in one figure")
+    command = commands.add_parser(
+        "curves", parents=[takes("run folder"), shared], help="draw learning curves of several runs in one figure"
+    )
     command.set_defaults(draw=curves)
     command = commands.add_parser(
-        "holdout", parents=[shared], help="draw Figure 5: learning curves and trajectories of the ant"
+        "holdout",
+        parents=[takes("run folder or checkpoint file"), shared],
+        help="draw Figure 5: learning curves and trajectories of the ant",
     )
     command.set_defaults(draw=holdout)
-    command = commands.add_parser("exploration", parents=[shared], help="draw Figure 6: paths of random exploration")
+    command = commands.add_parser(
+        "exploration",
+        parents=[takes("run folder, checkpoint file or builtin:CHARACTER"), shared],
+        help="draw Figure 6: paths of random exploration",
+    )
     command.add_argument(
         "--trajectories", type=count, default=48, metavar="N", help="number of paths (default %(default)s)"
     )
     command.add_argument("--seconds", type=seconds, default=10.0, help="duration of each path (default %(default)s)")
     command.set_defaults(draw=explore)
     command = commands.add_parser(
-        "primitives", parents=[shared], help="draw Figure 7: weights over the walk cycle, and actions"
+        "primitives",
+        parents=[takes("run folder, checkpoint file or builtin:CHARACTER"), shared],
+        help="draw Figure 7: weights over the walk cycle, and actions",
     )
     command.add_argument(
         "--clip", help="generated motion to follow, such as left_sharp (default: a walk straight ahead)"
@@ -87,6 +94,13 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--seconds", type=seconds, default=10.0, help="duration of each walk (default %(default)s)")
     command.set_defaults(draw=analyse)
+    return parser
+
+
+def takes(kinds: str) -> argparse.ArgumentParser:
+    """Return the parent of the parser of a command that takes checkpoints, of the kinds that its help names."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("checkpoints", nargs="+", metavar="CHECKPOINT", help=kinds)
     return parser
 
 
