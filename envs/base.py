@@ -479,7 +479,9 @@ class CharacterEnv(EnvBase):
         return self.one_each("reward", self.reward()), self.one_each("terminated", self.terminated())
 
     def one_each(self, method: str, value: Tensor) -> Tensor:
-        """Return the value of a task's method, after checking that it has one number or flag for each simulation.
+        """Return a copy of the value of a task's method, after checking that it has one entry for each simulation.
+
+        The value may be a live view of the simulation or of the episode, which the next episode overwrites.
 
         Raises:
             ValueError: If its shape is not ``(N,)``.
@@ -489,7 +491,7 @@ class CharacterEnv(EnvBase):
                 f"{type(self).__name__}.{method}() has shape {tuple(value.shape)}: return {(self.num_envs,)}, one for "
                 "each simulation"
             )
-        return value
+        return value.clone()
 
     @property
     def metric_names(self) -> dict[str, list[str]]:

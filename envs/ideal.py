@@ -41,7 +41,8 @@ def transport_reach(
 
     def reward_of(*state: Tensor) -> Tensor:
         com, _, position, _, target = state
-        left, away = (torch.linalg.vector_norm(position - other, dim=-1) for other in (target, com))
+        left = torch.linalg.vector_norm(position - target, dim=-1)
+        away = torch.linalg.vector_norm(position - com, dim=-1)
         return reward(*state).masked_fill((left < success_distance) & (away < success_reach), 1.0)
 
     still = torch.zeros_like(com)

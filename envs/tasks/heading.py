@@ -148,7 +148,7 @@ class Heading(PDCharacterEnv):
         )
 
     def steer(self, goal: UserGoal) -> None:
-        """See :meth:`.CharacterEnv.steer`: the user has direction and speed in hand, or neither."""
+        """See :meth:`.CharacterEnv.steer`: while the user sets the direction or the speed, the task changes neither."""
         self._steered = goal.direction is not None or goal.speed is not None
         if goal.direction is not None:
             self.episode["direction"][0] = goal.direction

@@ -120,6 +120,8 @@ class Imitation(PDCharacterEnv):
         max_episode_steps: Count = 300,
         **kwargs: Any,
     ) -> None:
+        if kwargs.get("curriculum") is not None:
+            raise ValueError("imitation has no curriculum: leave it out")
         if not isinstance(clips, MotionLibrary | Mapping):
             raise ValueError(
                 f"clips={clips!r} must be a MotionLibrary or clips by name: read a folder with folder_library of "
@@ -145,9 +147,7 @@ class Imitation(PDCharacterEnv):
             "error": torch.zeros((), dtype=torch.float64),
             "terms": torch.zeros(len(terms), dtype=torch.float64),
         }
-        super().__init__(
-            character, num_envs, max_episode_steps=max_episode_steps, episode=reference, curriculum=None, **kwargs
-        )
+        super().__init__(character, num_envs, max_episode_steps=max_episode_steps, episode=reference, **kwargs)
         self.goal_layout = bodies_layout([f"step_{step + 1}.{name}" for step in range(NUM_TARGETS) for name in names])
         self.library = library.to(self.device)
         self._layout = joint_layout(character).to(self.device)
@@ -322,8 +322,9 @@ class Imitation(PDCharacterEnv):
                 linear, angular = (qvel - reference.qvel)[:, :6].square().split(3, -1)
                 return linear.sum(-1) + 0.1 * angular.sum(-1)
             case "key_positions":
-                positions_at, other = (at[:, self._keys] - at[:, :1] for at in (positions, targets))
-                return squared_distances(positions_at, other).mean(-1)
+                own = positions[:, self._keys] - positions[:, :1]
+                target = targets[:, self._keys] - targets[:, :1]
+                return squared_distances(own, target).mean(-1)
             case "bodies":
                 return squared_distances(positions, targets).mean(-1)
             case "orientations":

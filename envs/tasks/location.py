@@ -11,6 +11,7 @@ from torchrl_mcp.adapters.contract import Reach
 from torchrl_mcp.envs.characters.mirror import VECTOR_SIGNS, Mirror, mirror_signs
 from torchrl_mcp.envs.observations import UNITS
 from torchrl_mcp.envs.pd_character import PDCharacterEnv
+from torchrl_mcp.envs.physics.simulation import LARGEST
 from torchrl_mcp.envs.rendering.camera import Arrow
 from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.steering import Steerable, UserGoal
@@ -44,7 +45,8 @@ class Location(PDCharacterEnv):
       than 0.1 m/s, and, with ``final_directions``, whether it faces the direction within 30 degrees.
     - ``at_place`` (1) is 1 if the character has arrived and 0 otherwise, so that its mean is a share of time.
     - ``seconds_to_success`` (1) is the duration of the episode until the first success at a place, and 0 afterwards.
-      Its mean over an episode with one place is the time to success, or the whole duration without success.
+      In an episode with one place that lasts until its time limit, the mean is the time to success, or the whole
+      duration without success. A fall after the success shortens the episode, so that the mean is larger.
 
     Args:
         character: ``"biped"``, ``"humanoid"`` or ``"trex"``.
@@ -164,14 +166,17 @@ class Location(PDCharacterEnv):
         return Steerable(direction=heading, speed=self.speed, speeds=(0.0, self.speed), place=True)
 
     def steer(self, goal: UserGoal) -> None:
-        """See :meth:`.CharacterEnv.steer`: in the user's hands, the place stays; let go, the task draws another."""
+        """See :meth:`.CharacterEnv.steer`: a place that the user sets stays.
+
+        When the user releases the place, the task draws another.
+        """
         target = None if goal.place is None else self.com.new_tensor(goal.place)
         if goal.direction is not None and goal.speed:
             velocity = goal.speed * unit_vector(self.com.new_tensor(goal.direction))
             target = place_ahead(self.com[0, :2], velocity)
         if target is not None:
             self.episode["target"][0] = target
-            self.episode["seconds_left"][0] = math.inf
+            self.episode["seconds_left"][0] = LARGEST / 2  # finite, so that a snapshot can be restored
         elif self._steered:
             self.episode["seconds_left"][0] = 0.0
         self._steered = target is not None

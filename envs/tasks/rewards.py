@@ -176,7 +176,8 @@ def transport_reward(
     ways = torch.stack([position - com, target - position])
     towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a zero vector
     missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
-    (cv, bv), (cp, bp) = missing_speeds.square(), ways.square().sum(-1)
+    cv, bv = missing_speeds.square()
+    cp, bp = ways.square().sum(-1)
     exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
     return exponents.exp() @ _on(exponents.device, tuple(weights)).to(exponents.dtype)
 

@@ -120,10 +120,10 @@ def way(env: PDCharacterEnv, place: Tensor, ids: Tensor | slice = ALL) -> Tensor
 def walkable(offset: Tensor) -> Tensor:
     """Replace places more than :data:`ASIDE` aside, which a character could face only by turning on the spot.
 
-    One beyond :data:`STEP` is seen a step away at this angle, so that the character turns on an arc. One that it has
-    reached, within :data:`ARRIVAL_DISTANCE`, is seen where it stands, so that it does not turn back to what it has
-    overshot. Characters fall when they turn on the spot, the T-Rex most. The paper has no such task; angle and
-    distances were chosen by falls of the built-in gates.
+    A place beyond :data:`STEP` is shown at this angle and at the distance :data:`STEP`, so that the character turns on
+    an arc. A place within :data:`ARRIVAL_DISTANCE` is shown at the character, so that the character does not turn back
+    to a place that it has overshot. Characters fall when they turn on the spot, the T-Rex most. The paper has no such
+    task; angle and distances were chosen by falls of the built-in gates.
 
     Args:
         offset: Places relative to a character in its heading frame, ``(*B, 2)``, in metres.
@@ -134,10 +134,10 @@ def walkable(offset: Tensor) -> Tensor:
     angle = torch.atan2(offset[..., 1], offset[..., 0])
     distance = torch.linalg.vector_norm(offset, dim=-1)
     on_arc = steps(torch.full_like(distance, STEP), ASIDE * angle.sign())
-    aside, far, reached = (
-        flag.unsqueeze(-1) for flag in (angle.abs() > ASIDE, distance > STEP, distance < ARRIVAL_DISTANCE)
-    )
-    return torch.where(aside & far, on_arc, torch.where(aside & reached, 0.0, offset))
+    aside = angle.abs() > ASIDE
+    far = (aside & (distance > STEP)).unsqueeze(-1)
+    reached = (aside & (distance < ARRIVAL_DISTANCE)).unsqueeze(-1)
+    return torch.where(far, on_arc, torch.where(reached, 0.0, offset))
 
 
 def _turned(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -162,6 +162,22 @@ def test_the_card_says_how_the_policy_was_trained_and_names_no_folder(run, libra
     assert str(run.parent) not in card + str(checkpoint.saved_config(library / "mcp-biped-heading.torchrl"))
 
 
+def test_the_command_on_a_card_has_neither_folders_nor_what_makes_no_other_run():
+    words = ["torchrl-mcp-train", "seed=0", "pretrained=/home/me/runs/pre", "+motions.path=/home/me/my clips"]
+    written = publish.command([*words, "+num_threads=1", "++device=cuda", "run_dir=/home/me/runs/a"])
+    assert written == "torchrl-mcp-train seed=0 pretrained=pre '+motions.path=my clips'"
+
+
+def test_a_policy_that_cannot_be_evaluated_leaves_no_file(run, monkeypatch, tmp_path):
+    def fail(*_, **__):
+        raise MemoryError("no memory")
+
+    monkeypatch.setattr(policies, "evaluation", fail)
+    with pytest.raises(MemoryError):
+        publish.publish(run, tmp_path / "gate.torchrl", episodes=1, limits=[])
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("taken", ["notes.md", "notes.torchrl"])
 def test_no_file_is_overwritten(run, taken, tmp_path):
     (tmp_path / taken).write_text("mine")

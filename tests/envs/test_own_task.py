@@ -51,6 +51,24 @@ def test_a_reward_or_an_end_of_another_shape_is_named(method):
     refused(lambda: step(wrong()), f"Wrong.{method}()", "(3, 1)", "(3,)")
 
 
+def test_an_end_that_the_task_keeps_for_the_episode_stays_in_the_step_that_ended_it():
+    class Ends(Stand):
+        def __init__(self):
+            super().__init__(finished=False, episode={"ended": torch.zeros((), dtype=torch.bool)})
+            self.make_specs()
+
+        def after_step(self, diverged):
+            self.episode["ended"][:] = True
+
+        def terminated(self):
+            return self.episode["ended"]
+
+    env = Ends()
+    outcome, _ = env.step_and_maybe_reset(env.reset().set("action", torch.zeros(env.action_spec.shape)))
+    assert outcome["next", "terminated"].all()
+    assert not env.episode["ended"].any()  # the next episodes have begun
+
+
 @pytest.mark.parametrize(
     ("extra", "name"), [({"observation": None}, "observation"), ({"close": torch.zeros(3)}, "close")]
 )

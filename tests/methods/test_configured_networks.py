@@ -55,6 +55,18 @@ def test_the_configuration_builds_appendix_e_for_the_biped(method, stage, parame
     assert counts == {"observation_normaliser": 0, "goal_normaliser": 0, **parameters}
 
 
+@pytest.mark.parametrize(
+    ("method", "part"), [("mcp", "primitives"), ("moe", "primitives"), ("option_critic", "options")]
+)
+def test_std_gain_is_the_factor_on_the_outputs_for_log_standard_deviations(method, part):
+    cfg = compose_run(f"method={method}", "task=imitation", "std_gain=0.5", "width=0.05")
+    primitives, states = instantiate(cfg.parts)(Sizes(105, 208, 17))[part], torch.randn(10, 105)
+    _, before = primitives(states)
+    with torch.no_grad():
+        primitives.output.bias[:, 17:] += 1.0
+    torch.testing.assert_close(primitives(states)[1] / before, torch.full_like(before, 0.5).exp())
+
+
 # Worked out by hand for a biped (S = 105, A = 17) whose goal has two numbers; a hidden body of 1024-512 on F inputs has
 # 1024 F + 1024 + 1024 * 512 + 512 parameters: 633344 for F = 105, 635392 for F = 107.
 COUNTS = {

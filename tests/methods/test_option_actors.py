@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from refusals import refused
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
@@ -14,6 +15,7 @@ from torchrl_mcp.methods.hierarchical import gated_actor, gated_parts, primitive
 from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts
 from torchrl_mcp.methods.options import SeparateOptions, Terminations
 from torchrl_mcp.modules import GaussianPolicy, JointGating, Primitives
+from torchrl_mcp.runs.configuration import compose_run
 
 S, G, A, K, N = 6, 2, 3, 4, 12
 POLICY = partial(GaussianPolicy, num_cells=(16, 8), std=0.3, output_gain=1.0)
@@ -122,6 +124,19 @@ def test_the_loss_sees_the_probability_with_which_the_policy_drew(method):
     kept = sample.select("observation", "goal", "next", *actor.stored)
     log_prob = actor.trained.get_dist(kept).log_prob(sample[actor.sampled])
     torch.testing.assert_close(log_prob, sample[actor.log_prob])
+
+
+def test_the_entropy_of_the_gate_s_choices_has_its_weight_in_the_loss():
+    parts, actor = hierarchical()
+    cfg = compose_run("method=hierarchical", "task=heading", "stage=transfer", "entropy_coeff=0.3", "run_dir=never")
+    loss = instantiate(cfg.objective.loss)(actor.trained)
+    loss.set_keys(action=actor.sampled, sample_log_prob=actor.log_prob)
+    with torch.no_grad():
+        samples = actor.policy(situations())
+    samples["advantage"] = torch.randn(N, 1)
+    shares = parts["gating"](samples["observation"], samples["goal"]).softmax(-1)
+    entropy = -(shares * shares.log()).sum(-1).mean()
+    torch.testing.assert_close(loss(samples)["loss_entropy"], -0.3 * entropy)
 
 
 def test_deterministic_choices_and_actions_repeat_themselves():

@@ -136,7 +136,7 @@ def test_the_clip_that_is_followed_says_which_option_acts_in_and_after_every_ste
 
 def test_as_many_options_as_clips_are_needed():
     env = TransformedEnv(Lengths(), ClipAsOption(num_options=7))
-    refused(lambda: env.observation_spec, "num_options=7", "3")
+    refused(lambda: env.observation_spec, "num_primitives=7", "3", "goal_number")
 
 
 def test_environments_with_a_memory_are_put_into_a_state_and_saved_as_a_whole():

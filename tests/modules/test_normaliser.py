@@ -3,6 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused
+from torch import nn
 
 from torchrl_mcp.modules import RunningNormaliser
 
@@ -106,6 +107,15 @@ def test_statistics_have_the_precision_of_the_buffers_whatever_the_samples_have(
     normaliser.update(x)
     variance, mean = torch.var_mean(x.double(), dim=0, correction=0)
     torch.testing.assert_close((normaliser.mean, normaliser.variance), (mean.float(), variance.float()))
+
+
+def test_inputs_in_float64_are_normalised_for_networks_in_float32():
+    x = 5 + torch.randn(100, 2, generator=torch.Generator().manual_seed(0))
+    normaliser = RunningNormaliser(2)
+    normaliser.update(x)
+    assert nn.Linear(2, 1)(normaliser(x.double())).dtype == torch.float32
+    assert torch.equal(normaliser(x.double()), normaliser(x))
+    assert normaliser.double()(x.double()).dtype == torch.float64
 
 
 @pytest.mark.parametrize("width", [1, 5])

@@ -215,6 +215,22 @@ def test_in_autocast_the_estimates_stay_float32():
     assert all(batch[key].dtype == torch.float32 for key in ("advantage", "value_target"))
 
 
+def test_autocast_changes_no_bit_of_the_estimates_for_given_values():
+    batch = trajectories([[CONTINUES, TRUNCATED, CONTINUES, TERMINATED] * 5] * 2, seed=0)
+    expected = Advantages(critic(), gamma=0.95, lmbda=0.95, clip=4.0)(batch.clone())
+    with torch.autocast("cpu", torch.bfloat16):
+        found = Advantages(critic(), gamma=0.95, lmbda=0.95, clip=4.0)(batch)
+    assert all(torch.equal(found[key], expected[key]) for key in ("advantage", "value_target"))
+
+
+def test_rewards_in_float64_change_nothing():
+    batch = trajectories([[CONTINUES, TRUNCATED, CONTINUES, TERMINATED]] * 2, seed=0)
+    expected = Advantages(critic(), gamma=0.95, lmbda=0.95, clip=4.0)(batch.clone())
+    batch["next", "reward"] = batch["next", "reward"].double()
+    found = Advantages(critic(), gamma=0.95, lmbda=0.95, clip=4.0)(batch)
+    assert all(torch.equal(found[key], expected[key]) for key in ("advantage", "value_target"))
+
+
 def option_advantages(critic, **kwargs):
     return OptionAdvantages(critic, epsilon=0.1, termination_cost=0.01, **kwargs)
 

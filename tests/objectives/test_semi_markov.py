@@ -169,7 +169,7 @@ def test_a_single_choice_has_no_advantage_over_others():
 def test_a_batch_without_choices_is_refused():
     batch = trajectories([[1.0, 1.0]], [[0.0, 0.0, 0.0]], [[GOES_ON, GOES_ON]], [[False, False]])
     advantages = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.9, clip=4.0)
-    refused(lambda: advantages(batch), "training.frames_per_batch")
+    refused(lambda: advantages(batch), "training.frames_per_batch", "batch_factor", "training.num_envs")
 
 
 def two_choices_in_each_of_four_rows():

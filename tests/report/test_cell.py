@@ -211,6 +211,34 @@ def test_the_place_between_standing_still_and_the_ideal_is_averaged_over_seeds(w
     assert cell.reach == pytest.approx({"skill": 0.6, "standing": 0.2, "ideal": 0.6})
 
 
+def test_a_reach_of_another_version_is_left_out(write_run):
+    folder = write_run("a", task="dribble", score=0.5)
+    found = json.loads((folder / "evaluation.json").read_text())
+    found["deterministic"]["reach"] = {"place": 0.5, "standing": 0.2, "ideal": 0.6}
+    (folder / "evaluation.json").write_text(json.dumps(found))
+    (cell,) = grouped(folder)
+    assert (len(cell.complete), cell.reach) == (1, {})
+
+
+def test_a_seed_that_occurs_twice_counts_once_in_every_mean(write_run):
+    folders = [write_run(name, seed=seed, task="dribble", score=score) for name, seed, score in COPIES]
+    for folder, (_, _, score) in zip(folders, COPIES, strict=True):
+        found = json.loads((folder / "evaluation.json").read_text())
+        found["deterministic"] |= {"metrics": {"success": score}, "success_return": score}
+        found["deterministic"]["reach"] = {"skill": score, "standing": 0.2, "ideal": 0.6}
+        (folder / "evaluation.json").write_text(json.dumps(found))
+    (cell,) = grouped(*folders)
+    mean = (0.2 + (0.6 + 0.8) / 2) / 2
+    assert cell.mean().value == pytest.approx(mean)
+    assert cell.metrics["success"] == pytest.approx(mean)
+    assert cell.reach["skill"] == pytest.approx(mean)
+    assert cell.success_return == pytest.approx(mean)
+
+
+COPIES = [("a", 0, 0.2), ("b", 1, 0.6), ("copy", 1, 0.8)]
+"""Runs by name, with seed and result; two runs have the same seed."""
+
+
 def test_metrics_are_means_over_seeds_of_deterministic_episodes_without_terms_of_the_reward(write_run):
     folders = [write_run(str(seed), seed=seed, task="carry", score=0.5) for seed in range(2)]
     for folder, share in zip(folders, (0.25, 0.75), strict=True):

@@ -116,6 +116,39 @@ def test_an_argument_that_only_some_runs_name_tells_them_apart(write_run):
     assert told == {0: {"task.transfer.max_turn": "default"}, 1: {"task.transfer.max_turn": 0.3}}
 
 
+MIXTURE = "task__transfer__curriculum__mixture"
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({"optimizer__schedule": None}, {"optimizer__schedule": {"max": 1e-3}}, "optimizer.schedule"),
+        (
+            {"task__transfer__curriculum__initial_states": "rest"},
+            {"task__transfer__curriculum__initial_states": {"rest": 1.0, "motions": 0.5}},
+            "task.transfer.curriculum.initial_states",
+        ),
+        ({MIXTURE: [{"weight": 1.0}, {"weight": 2.0}]}, {MIXTURE: [{"weight": 1.0}]}, f"{MIXTURE}.1.weight"),
+        ({"parts__layers": [{"width": 4}]}, {"parts__layers": [{"width": 4}, {"width": 8}]}, "parts.layers.1.width"),
+        (
+            {"task__transfer__curriculum": {"success_worth": 2.0, "random_first_length": True}},
+            {"task__transfer__curriculum": {"random_first_length": True}},
+            "task.transfer.curriculum.success_worth",
+        ),
+    ],
+    ids=[
+        "null or a group",
+        "a name or a group",
+        "shorter list of a curriculum",
+        "shorter list",
+        "left out of a curriculum",
+    ],
+)
+def test_a_group_in_another_form_tells_runs_apart(write_run, first, second, name):
+    found = grouped(write_run("a", **first), write_run("b", seed=1, **second))
+    assert [set(cell.settings) for cell in found] == [{name.replace("__", ".")}] * 2
+
+
 @pytest.mark.parametrize("setting", ["motions.seed", "imitation.switch_to"])
 def test_a_pretraining_tells_transfers_apart_that_keep_its_networks(write_run, write_mcp, setting):
     for write, expected in ((write_run, 1), (write_mcp, 2)):

@@ -188,6 +188,16 @@ def test_a_short_run_of_one_method_leaves_the_others_their_runs(run_writers, tmp
     assert ours == pytest.approx({"Finetune": 0.1, "MCP": 0.6})
 
 
+@pytest.mark.parametrize("trial", [{"preset": "smoke"}, {"preset": None, "demo__minutes": 8}], ids=["smoke", "demo"])
+def test_a_trial_represents_a_method_only_where_there_is_nothing_else(run_writers, tmp_path, trial):
+    _, write_mcp = run_writers(tmp_path)
+    write_mcp("usual", total_frames=4000, score=0.6)
+    for task in ("heading", "carry"):
+        write_mcp(f"trial-{task}", task=task, total_frames=256, score=0.1, **trial)
+    panels = drawn(tmp_path).axes
+    assert [bars(panel)["MCP"]["ours"] for panel in panels] == pytest.approx([0.6, 0.1])
+
+
 def test_methods_without_a_common_row_have_a_panel_less(run_writers, tmp_path):
     write_run, write_mcp = run_writers(tmp_path)
     for task, method in (("heading", "scratch"), ("carry", "finetune")):

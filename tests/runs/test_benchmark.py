@@ -350,3 +350,8 @@ def test_a_plan_refers_to_hydra_for_the_names_of_folders_and_leaves_it_as_it_was
 def test_rows_with_numbers_are_selected_by_the_command_line():
     rows = [{"num_primitives": [4, 8]}]
     assert list(benchmark.expand(rows, {"num_primitives": ["4"]})) == [{"num_primitives": "4"}]
+
+
+def test_nothing_and_flags_in_rows_are_those_of_the_command_line():
+    rows = [{"pretrained": [None], "progress_bar": [True, False]}]
+    assert list(benchmark.expand(rows, {"progress_bar": ["true"]})) == [{"pretrained": "null", "progress_bar": "true"}]

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from torchrl_mcp.evaluation.rollout import evaluate
 from torchrl_mcp.runs import arguments as called
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, policies
 from torchrl_mcp.runs.configuration import compose_run
 
 STAGES = {
@@ -174,3 +174,18 @@ class Push(torch.nn.Module):
 
     def forward(self, seen):
         return seen.set("action", self.action)
+
+
+def test_single_clips_are_followed_by_the_rules_of_evaluations(monkeypatch):
+    class Restored(Exception):
+        pass
+
+    def restore(_, **arguments):
+        raise Restored(arguments)
+
+    monkeypatch.setattr(policies, "restore", restore)
+    monkeypatch.setattr(policies, "policy_config", lambda _: compose_run("task=imitation", "+imitation.max_error=0.5"))
+    with pytest.raises(Restored) as restored:
+        policies.evaluate_clips("run", episodes=1, seed=0, max_episode_steps=30)
+    (arguments,) = restored.value.args
+    assert (arguments["max_error"], arguments["terminate_on_fall"], arguments["max_episode_steps"]) == (0.3, True, 30)

@@ -17,6 +17,7 @@ from torchrl_mcp.commands import evaluate, train
 from torchrl_mcp.runs import benchmark, build, experiment, policies, records
 from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training.checkpoint import run_checkpoint
+from torchrl_mcp.training.update import Agent
 
 LENGTHS = ["task.evaluation.max_episode_steps=40", "task.pretrain.max_episode_steps=30"]
 CONFIGS = sorted(Path(conf.__file__).parent.rglob("*.yaml"))
@@ -250,3 +251,24 @@ def test_every_configuration_file_is_short_and_says_what_it_is(path):
     assert path.name == "train.yaml" or len(lines) <= {"method": 30, "preset": 25, "task": 50, "conf": 50}.get(
         path.parent.name, 20
     )
+
+
+def test_the_rehearsal_of_the_evaluation_uses_up_no_random_numbers_of_a_gpu(tmp_path, monkeypatch):
+    cfg = compose_run(*SMOKE, *LENGTHS, f"run_dir={tmp_path}/run", "evaluation.episodes=2")
+    trainer = build.make_run(cfg, tmp_path / "run")
+    generator = {"drawn": torch.tensor(7)}  # stands for the GPU's
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: generator["drawn"].clone())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, device: generator.update(drawn=state))
+    monkeypatch.setattr(Agent, "device", property(lambda agent: torch.device("cuda")))
+    real = experiment.evaluate
+
+    def evaluate_on_gpu(policy, env, *, max_steps, device):
+        assert device.type == "cuda"
+        generator["drawn"] += 1
+        return real(policy, env, max_steps=max_steps, device="cpu")
+
+    monkeypatch.setattr(experiment, "evaluate", evaluate_on_gpu)
+    before = torch.get_rng_state()
+    experiment._rehearse(trainer, cfg)
+    assert generator["drawn"] == 7
+    assert torch.equal(torch.get_rng_state(), before)

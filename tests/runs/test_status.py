@@ -57,6 +57,23 @@ def test_the_return_is_that_of_the_evaluation_once_there_is_one(runs):
     assert status(runs / "finished").remaining is None
 
 
+def test_a_run_that_is_continued_is_not_done_because_it_was_evaluated_before(tmp_path):
+    run = make_run(tmp_path / "run", frames=1000, evaluation=0.75)
+    assert status(run).state == "done"
+    (run / "config.yaml").write_text("training: {total_frames: 2000}\n")
+    assert (status(run).state, status(run).total) == ("stopped", 2000)
+
+
+def test_parts_of_a_benchmark_that_are_started_one_after_the_other_are_all_planned(tmp_path):
+    manifest = tmp_path / "multirun" / "benchmark-x.json"
+    write_manifest({tmp_path / "carry": 1000}, manifest)
+    write_manifest({tmp_path / "heading": 500}, manifest)
+    assert {one.folder.name: (one.state, one.total) for one in look(tmp_path)} == {
+        "carry": ("waiting", 1000),
+        "heading": ("waiting", 500),
+    }
+
+
 @pytest.mark.parametrize("blank", ["nan", ""])
 def test_without_an_episode_that_ended_a_run_has_no_return(tmp_path, blank):
     run = make_run(tmp_path / "run", frames=400)

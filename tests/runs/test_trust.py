@@ -95,3 +95,9 @@ def test_what_is_no_configuration_is_refused_within_seconds(tmp_path, content):
     began = time.process_time()
     refused(lambda: read_config(file), str(file))
     assert time.process_time() - began < 10
+
+
+def test_a_configuration_in_another_encoding_is_refused(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_bytes("a: é".encode("latin-1"))
+    refused(lambda: read_config(file), str(file))

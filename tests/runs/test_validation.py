@@ -64,6 +64,19 @@ def test_a_step_size_that_the_first_update_would_replace_is_refused(word):
     refused(lambda: require_valid(cfg), "step_size.actor", "step_size.max")
 
 
+@pytest.mark.parametrize("size", ["training.num_envs=48", "training.minibatch_size=100"])
+def test_a_batch_that_does_not_divide_is_refused_with_the_numbers_of_the_settings(size):
+    plain = composed(*place("mcp", "dribble"), "training.frames_per_batch=4096", size)
+    message = refused(lambda: require_valid(plain), "training.frames_per_batch=4096", size)
+    assert "batch_factor" not in message
+    choices = composed(*place("hierarchical", "heading"), "training.frames_per_batch=4096", size)
+    refused(lambda: require_valid(choices), "training.frames_per_batch=4096", "batch_factor=8", size)
+
+
+def test_a_batch_may_divide_only_with_its_factor():
+    require_valid(composed(*place("hierarchical", "heading"), "training.num_envs=8", "training.minibatch_size=32768"))
+
+
 WRONG = {
     "seed": ["null", "-1", "1.5", "many", str(2**32)],
     "training.num_envs": ["0", "1.5", "null", "-4", "[1]"],

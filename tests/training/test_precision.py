@@ -104,9 +104,12 @@ def test_a_run_notes_the_choice_of_its_machine_and_keeps_it_on_another(
     OmegaConf.save(cfg, folder / "config.yaml")
     seen = []
     autocast = torch.autocast
-    monkeypatch.setattr(
-        torch, "autocast", lambda *a, enabled, **k: seen.append(enabled) or autocast(*a, enabled=enabled)
-    )
+
+    def watched(device, *dtype, enabled):
+        seen.extend([enabled] * len(dtype))  # without a type, a layer leaves the precision of the run
+        return autocast(device, *dtype, enabled=enabled)
+
+    monkeypatch.setattr(torch, "autocast", watched)
     monkeypatch.setattr(records, "machine", lambda device: {"processor": "Another", "device": device})
     processor(ratio=5.0, amx_bf16=not chosen)
     with pytest.warns(UserWarning, match=r"5\.0 times as long") if chosen else nullcontext():

@@ -4,8 +4,9 @@ import sys
 import tempfile
 
 import pytest
+from refusals import refused
 
-from torchrl_mcp.training.run_folder import remove_leftovers, replacing, write_json
+from torchrl_mcp.training.run_folder import read_json, remove_leftovers, replacing, write_json
 
 
 def test_readers_find_the_old_content_until_the_new_is_whole(tmp_path):
@@ -55,6 +56,13 @@ def test_where_folders_cannot_be_flushed_files_still_are(tmp_path, monkeypatch):
         partial.write_text("new")
     assert len(flushed) == 1
     assert (tmp_path / "numbers.csv").read_text() == "new"
+
+
+@pytest.mark.parametrize("content", [b"{", b"[1]", b"\xe9", b"[" * 100_000])
+def test_a_damaged_file_is_named_with_the_remedy(tmp_path, content):
+    path = tmp_path / "origin.json"
+    path.write_bytes(content)
+    refused(lambda: read_json(path), str(path), "copy")
 
 
 def test_json_is_written_into_folders_that_are_made(tmp_path):

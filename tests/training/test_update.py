@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from refusals import refused
 from tensordict import TensorDict
 from torch import nn
 
 from torchrl_mcp.objectives import ActorLoss
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.training.update import Objective, Update
+from torchrl_mcp.training.update import Objective, PPOSettings, Update
 
 
 class Pull(ActorLoss):
@@ -56,6 +57,14 @@ class Numbered:
     def __call__(self, batch):
         batch["advantage"] = torch.arange(32.0).view(4, 8, 1)
         return batch
+
+
+@pytest.mark.parametrize(("num_envs", "minibatch_size"), [(7, 32), (4, 100)])
+def test_settings_whose_batches_do_not_divide_are_refused(num_envs, minibatch_size):
+    numbers = {"num_epochs": 1, "warmup_batches": 0, "checkpoint_interval": 1, "total_frames": 128}
+    sizes = {"frames_per_batch": 128, "num_envs": num_envs, "minibatch_size": minibatch_size}
+    words = [f"{name}={size}" for name, size in sizes.items()]
+    refused(lambda: PPOSettings(**sizes, **numbers, max_grad_norm=None, autocast=False), *words)
 
 
 @pytest.mark.parametrize(("limit", "slope"), [("null", 7.0), (1.0, 1.0)])

@@ -292,7 +292,7 @@ class Adapter(EnvBase):
 
     @contextmanager
     def _called(self, what: str) -> Iterator[None]:
-        """Time a call of the environments, and say if it fails which environments failed, and where."""
+        """Time a call of the environments. If the call fails, the error names the environments and the call."""
         begun = time.perf_counter()
         try:
             yield

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 PROGRAM = "torchrl-mcp-publish"
 
 EXAMPLES = f"""\
-The file contains only the policy, in bfloat16, without the frozen parts of networks that come with the library. All
-commands accept the file as a CHECKPOINT. The model card beside it describes training, task and returns.
+The file contains only the policy, in bfloat16, without the frozen parts of networks that come with the library.
+Commands accept the file where they take a CHECKPOINT. The model card beside it describes training, task and returns.
 
 examples:
   {PROGRAM} runs/heading --output heading.torchrl --limits "falls on turns of more than 90 degrees"
@@ -86,12 +86,17 @@ def publish(run: Path, output: Path, *, episodes: int, limits: Sequence[str]) ->
     from torchrl_mcp.training import checkpoint
 
     cfg = records.run_config(run)
-    policies.publish_run(run, output)
-    numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
     origin = read_json(run / PROVENANCE) if (run / PROVENANCE).is_file() else {}
     steps = frames(checkpoint.find(run))
     trust = trust_options(run / CONFIG)
-    card.write_text(model_card(output, cfg, numbers, origin, steps=steps, limits=limits, trust=trust), encoding="utf-8")
+    policies.publish_run(run, output)
+    try:
+        numbers = policies.evaluation(output, episodes=episodes, seed=cfg.evaluation.seed)
+        text = model_card(output, cfg, numbers, origin, steps=steps, limits=limits, trust=trust)
+        card.write_text(text, encoding="utf-8")
+    except BaseException:
+        output.unlink()  # without a card, so that the command can be repeated
+        raise
     print(f"{output} ({output.stat().st_size / 1e6:.1f} MB)\n{card}")
 
 
@@ -156,7 +161,14 @@ def command(words: Sequence[str]) -> str:
     """Return the command that started a run, without folders of the machine and settings that make no other run."""
     from torchrl_mcp.runs.identity import SAME_RUN, is_among
 
-    return shlex.join(word for word in words if not is_among(word.partition("=")[0], SAME_RUN))
+    settings = [word.partition("=") for word in words]
+    kept = [parts for parts in settings if not is_among(parts[0].lstrip("+~"), SAME_RUN)]
+    return shlex.join(f"{name}{sign}{without_folder(value)}" for name, sign, value in kept)
+
+
+def without_folder(value: str) -> str:
+    """Return the value of a setting, of an absolute path only its last part."""
+    return Path(value).name if Path(value).is_absolute() else value
 
 
 def _contents(path: Path, cfg: "DictConfig") -> str:

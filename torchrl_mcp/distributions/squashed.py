@@ -67,10 +67,8 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
         composite = MultiplicativeGaussian(loc, scale, gates, validate_args)
         self.loc, self.scale, self.gates = composite.loc, composite.scale, composite.gates
         dtype, device = composite.mean.dtype, composite.mean.device
-        low, high = (
-            float(bound) if isinstance(bound, Real) else torch.as_tensor(bound, dtype=dtype, device=device)
-            for bound in (low, high)
-        )
+        low = float(low) if isinstance(low, Real) else torch.as_tensor(low, dtype=dtype, device=device)
+        high = float(high) if isinstance(high, Real) else torch.as_tensor(high, dtype=dtype, device=device)
         check_bounds(low, high, composite.event_shape, composite._validate_args)
         super().__init__(composite, Squash(low, high), validate_args)
 
@@ -132,7 +130,8 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
         mean, stddev = self.base_dist.mean, self.base_dist.stddev
         noise = torch.linspace(-6, 6, 97, dtype=mean.dtype, device=mean.device)
         weights = (-noise.square() / 2).softmax(0)
-        noise, weights = (x.view(-1, *[1] * mean.ndim) for x in (noise, weights))
+        noise = noise.view(-1, *[1] * mean.ndim)
+        weights = weights.view(-1, *[1] * mean.ndim)
         actions = self.transforms[0]._call(mean + stddev * noise)
         return (weights * function(actions)).sum(0)  # a matrix product would lose precision under autocast
 
@@ -171,8 +170,8 @@ class Squash(Transform):
     def __eq__(self, other: object) -> bool:
         """Whether the bounds are the same; then divergences before and after squashing are equal."""
         return isinstance(other, Squash) and all(
-            ours is theirs or bool(torch.as_tensor(ours == theirs).all())
-            for ours, theirs in ((self.low, other.low), (self.high, other.high))
+            bound is other_bound or bool(torch.as_tensor(bound == other_bound).all())
+            for bound, other_bound in ((self.low, other.low), (self.high, other.high))
         )
 
     def _margin(self, like: Tensor) -> Any:

@@ -26,7 +26,7 @@ class Evaluation:
     Attributes:
         returns: Undiscounted sum of the task's rewards in each episode, without shaping, ``(N,)``.
         lengths: Control steps of each episode, ``(N,)``.
-        terminated: Whether the episode ended before its time limit, ``(N,)``.
+        terminated: Whether the episode ended by a failure or by a success, and not by truncation, ``(N,)``.
         metrics: Other measurements of the task by name, ``(N,)``. For a flag such as ``success``, the value is whether
             the flag was ever raised in the episode; for a number such as ``tracking_error``, the mean over the steps.
         durations: Number of control steps of each episode in which a flag among the metrics was raised, ``(N,)``.

@@ -2,7 +2,8 @@
 
 A method first makes named *parts*, which are plain modules. Transfer keeps, freezes or makes anew each part by name.
 Then the method makes an :class:`Actor` from the parts: ``policy`` acts, and the loss differentiates ``trained``. Both
-are the same module unless the primitives are frozen, exploration acts on the gate, or noise enters before the action.
+are the same module unless the primitives are frozen, exploration acts on the gate, noise enters before the action, or a
+policy over options acts.
 
 | key | content | shape |
 |---|---|---|

@@ -51,9 +51,9 @@ def composite_parts(
         distribution_class: The mixer, of ``(loc, scale, gates)``. It needs the properties ``stddev`` and
             ``deterministic_sample``.
         initial_std: Standard deviation of the *composite* before training, in action units, for any ``K``. It is a root
-            mean square over normalised states and actions, and includes the variance of each primitive and the
-            variance between the means of the primitives. The mixer's standard deviation must be proportional to that
-            of its primitives, which excludes squashed actions.
+            mean square over normalised states and actions. For a mixture, it includes the variance between the means of
+            the primitives. The mixer's standard deviation must be proportional to that of its primitives, which
+            excludes squashed actions.
         learned_logits_std: Standard deviation of the logits before training, if :func:`weights_actor` is to learn it.
             If it is None, there is no part ``gate_noise``.
 
@@ -118,9 +118,9 @@ def _valid(weights: Tensor) -> Tensor:
 def _normalised_inputs(observation_dim: int, goal_dim: int, num: int = 1024) -> tuple[Tensor, Tensor]:
     """Return states ``(num, S)`` and goals ``(num, G)`` of zero mean and unit variance, the same at every call."""
     generator = torch.Generator("cpu").manual_seed(0)
-    made = (torch.randn(num, size, generator=generator, device="cpu") for size in (observation_dim, goal_dim))
-    states, goals = (values.to(torch.get_default_device()) for values in made)
-    return states, goals
+    states = torch.randn(num, observation_dim, generator=generator, device="cpu")
+    goals = torch.randn(num, goal_dim, generator=generator, device="cpu")
+    return states.to(torch.get_default_device()), goals.to(torch.get_default_device())
 
 
 def composite_actor(

@@ -25,7 +25,7 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
-from torchrl.modules import MLP, IndependentNormal
+from torchrl.modules import IndependentNormal
 
 from torchrl_mcp.methods.actor import (
     GOAL,
@@ -38,6 +38,7 @@ from torchrl_mcp.methods.actor import (
     normalise_inputs,
     sampler,
 )
+from torchrl_mcp.methods.critic import value_network
 from torchrl_mcp.methods.options import (
     EpsilonGreedy,
     RandomSequence,
@@ -45,7 +46,6 @@ from torchrl_mcp.methods.options import (
     keep_option,
     of_option,
 )
-from torchrl_mcp.modules.gating import scaled_cells
 from torchrl_mcp.values import Count, Positive, Share, Widths
 
 ARRIVAL = ("next", "observation")
@@ -78,13 +78,7 @@ def option_critic_parts(
             **input_normalisers(sizes),
             "options": options(sizes.observation, sizes.action, num_options),
             "terminations": terminations(sizes.observation, num_options),
-            "critic": MLP(
-                in_features=sizes.observation + sizes.goal,
-                out_features=num_options,
-                num_cells=scaled_cells(values_cells, width),
-                activation_class=nn.ReLU,
-                activation_kwargs={"inplace": True},
-            ),
+            "critic": value_network(sizes, num_options, num_cells=values_cells, width=width),
         }
     )
 

@@ -45,9 +45,9 @@ class SeparateOptions(nn.Module):
         states = observation.reshape(-1, observation.shape[-1])[order].split(counts)
         outputs = [policy(state, state[:, :0]) for policy, state in zip(self.policies, states, strict=True)]
         back = order.argsort()
-        merged = (torch.cat(output)[back] for output in zip(*outputs, strict=True))
-        loc, scale = (output.reshape(*option.shape, output.shape[-1]) for output in merged)
-        return loc, scale
+        loc = torch.cat([mean for mean, _ in outputs])[back]
+        scale = torch.cat([std for _, std in outputs])[back]
+        return loc.reshape(*option.shape, loc.shape[-1]), scale.reshape(*option.shape, scale.shape[-1])
 
 
 class Terminations(nn.Module):
@@ -205,9 +205,9 @@ class EpsilonGreedy(Choice):
         return self._best
 
 
-def keep_option(begins: Tensor, drawn: Tensor, held: Tensor) -> Tensor:
-    """Return the options ``drawn`` where an option begins, and the options ``held`` elsewhere, each ``(*B)``."""
-    return torch.where(begins, drawn, held)
+def keep_option(begins: Tensor, drawn_option: Tensor, previous_option: Tensor) -> Tensor:
+    """Return drawn options where an option begins, and the options of the previous step elsewhere, each ``(*B)``."""
+    return torch.where(begins, drawn_option, previous_option)
 
 
 def of_option(values: Tensor, option: Tensor) -> Tensor:

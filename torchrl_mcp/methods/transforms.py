@@ -85,10 +85,10 @@ class OptionMemory(Transform):
         self._restored = True
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        held = tensordict["held_option"]
+        previous_option = tensordict["held_option"]
         steps = tensordict["held_steps"]
         begins = tensordict.get("begins", torch.zeros_like(steps, dtype=torch.bool))
-        option = tensordict.get("option", held)
+        option = tensordict.get("option", previous_option)
         self._held = {"held_option": option.clone(), "held_steps": steps.masked_fill(begins, 0) + 1}
         return next_tensordict.update(self.get_extra_state())
 
@@ -128,9 +128,10 @@ class ClipAsOption(Transform):
         skills = getattr(self.parent, "num_goals", 0) or len(getattr(self.parent, "library", ()))
         if skills != self.num_options:
             raise ValueError(
-                f"num_options={self.num_options} must be the number of reference motions, which is {skills}: "
-                "pre-train with task=imitation and as many motions, such as motions=turning, or in an environment with "
-                "as many goals that observes the number of its goal (goal_number)"
+                f"num_primitives={self.num_options} must be the number of reference motions, which is {skills}: pass "
+                "this number as num_primitives, or pre-train with task=imitation and as many motions, such as "
+                "motions=turning, or in an environment with as many goals that observes the number of its goal "
+                "(goal_number)"
             )
         return _with_integers(observation_spec, "option")
 

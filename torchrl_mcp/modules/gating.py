@@ -52,9 +52,9 @@ class Gating(nn.Module):
         output_gain: NotNegative = 1.0,
     ) -> None:
         super().__init__()
-        state_cells, goal_cells, joint_cells = (
-            scaled_cells(cells, width) for cells in (state_cells, goal_cells, joint_cells)
-        )
+        state_cells = scaled_cells(state_cells, width)
+        goal_cells = scaled_cells(goal_cells, width)
+        joint_cells = scaled_cells(joint_cells, width)
         self.state_encoder = relu_mlp(observation_dim, state_cells)
         self.goal_encoder = relu_mlp(goal_dim, goal_cells)
         self.joint = relu_mlp(state_cells[-1] + goal_cells[-1], joint_cells)

@@ -10,7 +10,7 @@ from torchrl_mcp.modules.gating import relu_mlp, scaled_cells, scaled_linear
 from torchrl_mcp.values import NotNegative, Positive, Positives, Widths
 
 LEAST_STD = 1e-4
-"""Standard deviation at which TorchRL's :class:`AddStateIndependentNormalScale` clamps."""
+"""Smallest standard deviation of a policy whose noise is the same in all states, at which it is clamped."""
 
 
 class GaussianPolicy(nn.Module):
@@ -30,7 +30,7 @@ class GaussianPolicy(nn.Module):
         output_gain: Factor on the initial weights of the output layer.
 
     Raises:
-        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.
+        ValueError: If ``std`` is below ``1e-4`` or is neither one number nor one per action.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.2. https://arxiv.org/abs/1905.09808
@@ -76,7 +76,7 @@ def restart_noise(network: nn.Module, std: Positive) -> None:
         std: Standard deviation of all actions, in action units.
 
     Raises:
-        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit.
+        ValueError: If ``std`` is below ``1e-4``.
     """
     if not std >= LEAST_STD:
         raise ValueError(f"std must be at least {LEAST_STD:g}, got {std}")
@@ -91,12 +91,12 @@ def state_independent_scale(
     """Return the module that adds standard deviations, one for all actions or one each, to means ``(*B, A)``.
 
     Raises:
-        ValueError: If ``std`` is below ``1e-4``, TorchRL's limit, or is neither one number nor one per action.
+        ValueError: If ``std`` is below ``1e-4`` or is neither one number nor one per action.
     """
     scale = torch.as_tensor(std, dtype=torch.float32)
     if scale.numel() not in (1, action_dim) or not (scale >= LEAST_STD).all():
         raise ValueError(f"std must be one number of at least {LEAST_STD:g} or {action_dim}, one per action, got {std}")
-    module = AddStateIndependentNormalScale(action_dim, make_param=learned)
+    module = AddStateIndependentNormalScale(action_dim, scale_lb=LEAST_STD, make_param=learned)
     with torch.no_grad():
         module.state_independent_scale.copy_(scale.log())
     return module

@@ -58,12 +58,13 @@ class RunningNormaliser(nn.Module):
         self.count.data = self.count.expand_as(self.mean).clone()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise ``x``, shape ``(*B, F)``.
+        """Normalise ``x``, shape ``(*B, F)``; the result has the floating-point type of the statistics.
 
         Raises:
             ValueError: If ``x`` has another number of features.
         """
         self._require_features(x)
+        x = x.to(self.mean.dtype)
         return ((x - self.mean) * (self.variance + self.epsilon).rsqrt()).clamp(-self.clip, self.clip)
 
     @torch.no_grad()

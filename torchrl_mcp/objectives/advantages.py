@@ -55,13 +55,13 @@ class Advantages:
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Add ``advantage`` and ``value_target``, each ``(*B, T, 1)``, to trajectories of shape ``(*B, T)``."""
-        value = self._values(batch)
-        advantage, batch["value_target"] = self.gae(batch, value, upon_arrival(value, batch, self._values))
+        value = self._evaluate(batch)
+        advantage, batch["value_target"] = self.gae(batch, value, upon_arrival(value, batch, self._evaluate))
         batch["advantage"] = normalised(advantage, self.clip)
         return batch
 
-    def _values(self, states: TensorDictBase) -> Tensor:
-        return self.critic(states.select(*self.critic.in_keys))["state_value"].float()
+    def _evaluate(self, states: TensorDictBase) -> Tensor:
+        return state_values(self.critic, states)
 
 
 class ScaledGAE:
@@ -77,16 +77,23 @@ class ScaledGAE:
 
     def __init__(self, gamma: Discount, lmbda: Share) -> None:
         self.reward_scale = reward_scale(gamma)
-        self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+        # The vectorised form is a convolution, which would be in bfloat16 under autocast.
+        self.estimator = GAE(gamma=gamma, lmbda=lmbda, value_network=None, vectorized=False)
 
     def __call__(self, batch: TensorDictBase, value: Tensor, next_value: Tensor) -> tuple[Tensor, Tensor]:
         """Return advantages and targets of values, each ``(*B, T, 1)``, for trajectories ``(*B, T)`` with values."""
         trajectories = batch.select(("next", "done"), ("next", "terminated"))
         trajectories["state_value"] = value
         trajectories["next", "state_value"] = next_value
-        trajectories["next", "reward"] = batch["next", "reward"] * self.reward_scale
+        trajectories["next", "reward"] = self.reward_scale * batch["next", "reward"].to(value.dtype)
         self.estimator(trajectories)
         return trajectories["advantage"], trajectories["value_target"]
+
+
+def state_values(critic: TensorDictModuleBase, states: TensorDictBase) -> Tensor:
+    """Return the values of states ``(*B)`` under a critic, ``(*B, 1)``, in ``float32``."""
+    values: Tensor = critic(states.select(*critic.in_keys))["state_value"]
+    return values.float()
 
 
 def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[TensorDictBase], Tensor]) -> Tensor:
@@ -102,7 +109,8 @@ def upon_arrival(values: Tensor, batch: TensorDictBase, evaluate: Callable[[Tens
         evaluate: From states ``(M,)`` to values ``(M, F)``.
     """
     after = batch["next"]
-    cut = (after["done"] & ~after["terminated"]).squeeze(-1)  # not "truncated", which own transforms may leave out
+    # "truncated" is not read, because users' transforms may not write it
+    cut = (after["done"] & ~after["terminated"]).squeeze(-1)
     cut[..., -1] = True
     arrived = values.roll(-1, dims=-2)
     arrived[cut] = evaluate(after[cut])

@@ -100,11 +100,11 @@ class OptionAdvantages:
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Add the estimates, each ``(*B, T, 1)``, to trajectories of shape ``(*B, T)``."""
         option = batch["option"]
-        here = self._criticised(batch)
-        values, terminations = upon_arrival(here, batch, self._criticised).chunk(2, dim=-1)
+        outputs = self._criticised(batch)
+        values, terminations = upon_arrival(outputs, batch, self._criticised).chunk(2, dim=-1)
         kept = of_option(values, option)
         chosen = (EpsilonGreedy(values, self.epsilon).probs * values).sum(-1, keepdim=True)
-        value = of_option(here.chunk(2, dim=-1)[0], option)
+        value = of_option(outputs.chunk(2, dim=-1)[0], option)
         next_value = kept - of_option(terminations, option) * (kept - chosen)
         advantage, batch["value_target"] = self.gae(batch, value, next_value)
         batch["advantage"] = normalised(advantage, self.clip)

@@ -5,7 +5,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_mcp.objectives.advantages import normalised, reward_scale, upon_arrival
+from torchrl_mcp.objectives.advantages import normalised, reward_scale, state_values, upon_arrival
 from torchrl_mcp.values import Discount, Positive, Share
 
 
@@ -71,11 +71,11 @@ class SemiMarkovAdvantages:
         begins = batch["begins"]
         if not begins.any():
             raise ValueError(
-                f"no choice was made in {batch.shape[-1]} steps: training.frames_per_batch / training.num_envs must be "
-                "at least the steps that a choice lasts"
+                f"no choice was made in {batch.shape[-1]} steps of each environment: training.frames_per_batch * "
+                "batch_factor / training.num_envs must be at least the steps that a choice lasts"
             )
         value = torch.zeros(*batch.shape, 1, dtype=torch.float32, device=begins.device)
-        value[begins] = self._values(batch[begins])
+        value[begins] = self._evaluate(batch[begins])
         target = self._targets(batch, value)
 
         choices = batch[begins]
@@ -88,7 +88,7 @@ class SemiMarkovAdvantages:
         terminated = batch["next", "terminated"]
         done = batch["next", "done"].clone()
         done[..., -1, :] = True
-        next_value = upon_arrival(value, batch, self._values).masked_fill(terminated, 0.0)
+        next_value = upon_arrival(value, batch, self._evaluate).masked_fill(terminated, 0.0)
         lmbda = self.lmbda * (~done).to(value.dtype)
         ends = done | batch["begins"].roll(-1, dims=-1).unsqueeze(-1)
         reward = self.reward_scale * batch["next", "reward"].to(value.dtype)
@@ -100,5 +100,5 @@ class SemiMarkovAdvantages:
             target[..., t, :] = later = reward[..., t, :] + self.gamma * after
         return target
 
-    def _values(self, states: TensorDictBase) -> Tensor:
-        return self.critic(states.select(*self.critic.in_keys))["state_value"].float()
+    def _evaluate(self, states: TensorDictBase) -> Tensor:
+        return state_values(self.critic, states)

@@ -19,7 +19,7 @@ class MirroredSamples:
     computed with the current policy, so that the first ratio of PPO is one.
 
     A policy that is not symmetric may give an image almost no probability. The gradient of the log-probability would
-    then be so large that learning diverges, so that such a sample is not replaced.
+    then be so large that learning diverges. Such a sample is therefore not replaced.
 
     Args:
         advantages: Estimates advantages of trajectories ``(N, T)``, such as :class:`.Advantages`.
@@ -66,7 +66,10 @@ class MirroredSamples:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return the samples of trajectories ``(N, T)``, half of them mirrored, with the estimates of advantages."""
+        """Add the estimates of advantages to trajectories ``(N, T)``, and replace half of the samples by their images.
+
+        The samples are replaced in ``batch`` itself, so that the statistics of the normalisers include the images.
+        """
         samples = self.advantages(batch)
         chosen = torch.rand(samples.shape, device=samples.device) < 0.5
         if not chosen.any():

@@ -3,7 +3,7 @@
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
@@ -154,18 +154,30 @@ class Cell:
     @property
     def metrics(self) -> dict[str, float]:
         """Means over seeds of the metrics of deterministic episodes, without the terms of the reward."""
-        return shared_means([run.evaluation["deterministic"].get("metrics", {}) for run in self.complete], "reward_")
+        return self.over_seeds(lambda run: run.evaluation["deterministic"].get("metrics", {}), "reward_")
 
     @property
     def reach(self) -> dict[str, float]:
         """Means over seeds of ``skill``, ``standing`` and ``ideal`` of deterministic episodes; empty for some tasks."""
-        return shared_means([run.evaluation["deterministic"].get("reach", {}) for run in self.complete])
+        return self.over_seeds(lambda run: run.evaluation["deterministic"].get("reach", {}))
 
     @property
     def success_return(self) -> float | None:
         """Mean over seeds of the deterministic return with the reward 1 while successful; None if a run lacks it."""
-        returns = [run.evaluation["deterministic"].get("success_return") for run in self.complete]
-        return None if not returns or None in returns else fmean(returns)
+        name = "success_return"
+        if any(name not in run.evaluation["deterministic"] for run in self.complete):
+            return None
+        return self.over_seeds(lambda run: {name: run.evaluation["deterministic"][name]}).get(name)
+
+    def over_seeds(self, numbers: Callable[[Run], Mapping[str, float]], *left_out: str) -> dict[str, float]:
+        """Return the means over seeds of the numbers that all complete runs have, by name.
+
+        Args:
+            numbers: From a run to its numbers by name.
+            *left_out: Prefixes of names that are omitted.
+        """
+        seeds = [shared_means([numbers(run) for run in runs]) for runs in self.by_seed.values()]
+        return shared_means(seeds, left_out)
 
     @property
     def remarks(self) -> list[str]:
@@ -196,15 +208,42 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the names of settings with more than one value. An argument that is missing has the value ``default``."""
+    """Return the names of settings with more than one value.
+
+    An argument that a configuration leaves out has the value ``default``. A setting counts only if every configuration
+    states it, so that a setting of a later version of the library does not tell older runs apart.
+    """
     names = dict.fromkeys(name for one in settings for name in one)
-    shared = [name for name in names if all(name in one or _target(name) in one for one in settings)]
-    return [name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1]
+    groups = [{parent for name in one for parent in _parents(name)} for one in settings]
+    shared = [name for name in names if all(_states(*one, name=name) for one in zip(settings, groups, strict=True))]
+    different = {name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1}
+    return [name for name in shared if name in different and different.isdisjoint(_parents(name))]
 
 
-def _target(name: str) -> str:
-    """Return the name of the setting with the class or function of which a setting is an argument."""
-    return f"{name.rpartition('.')[0]}._target_"
+def _states(settings: Mapping[str, Any], groups: Collection[str], *, name: str) -> bool:
+    """Return whether a configuration states a setting, also by leaving it out.
+
+    It states a setting with a value or a group in its place, or with a value in place of a group that contains it. By
+    leaving it out, it states an argument of a class or function, a setting of a curriculum, and an item of a list.
+
+    Args:
+        settings: The values by their names.
+        groups: The names of the groups of settings.
+        name: Name of the setting.
+    """
+    parents = _parents(name)
+    if name in settings or name in groups or any(parent in settings for parent in parents):
+        return True
+    within = [parent for parent in parents if parent in groups]
+    is_item = any(name[len(parent) + 1].isdigit() for parent in within)
+    is_of_curriculum = any(parent.endswith(".curriculum") for parent in within)
+    return is_item or is_of_curriculum or (bool(parents) and f"{parents[-1]}._target_" in settings)
+
+
+def _parents(name: str) -> list[str]:
+    """Return the names of the groups that contain a setting, from the outermost to the innermost."""
+    parts = name.split(".")
+    return [".".join(parts[:number]) for number in range(1, len(parts))]
 
 
 def protocols(runs: Sequence[Run]) -> list[str]:

@@ -29,6 +29,9 @@ STATES = ("complete", "not evaluated", "unfinished", "damaged")
 VALUE_TYPES = {"choices": str, "machine": str | int}
 """Types of the values in the groups of a run's provenance."""
 
+REACH = {"skill", "standing", "ideal"}
+"""Entries of an evaluation's ``reach``."""
+
 MOST_FRAMES = 1e15
 """Upper bound on environment steps, which no training reaches."""
 
@@ -276,6 +279,8 @@ def _evaluation(folder: Path) -> dict[str, Any]:
                 raise ValueError(f"the {mode} normalised return is {value}")
         if wrong := [name for name, value in numbers.items() if not _is_quantity(name, value)]:
             raise ValueError(f"{mode} has values of a wrong type: {', '.join(wrong)}")
+        if numbers.get("reach", {}).keys() != REACH:
+            numbers.pop("reach", None)  # it is of another version of the library
     return {"evaluation": content}
 
 

@@ -49,7 +49,7 @@ def _returns(folder: Path) -> list[str]:
         for mode, numbers in modes.items()
     ]
     episodes = f"normalised return of {evaluation['episodes']} episodes, with 95 % intervals:"
-    if reach := modes["deterministic"].get("reach"):
+    if "skill" in (reach := modes["deterministic"].get("reach", {})):
         standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
         values.insert(
             1, f"{round(100 * reach['skill'])}% of the way from standing still ({standing}) to the ideal ({ideal})"

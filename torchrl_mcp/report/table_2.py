@@ -28,13 +28,16 @@ def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
 
     Scratch is represented by its longest runs, which may have the steps of both stages, and every other method by its
     shortest runs. Of cells with the same :func:`.choices`, the cell with the most seeds is taken. Of several choices,
-    such as two kinds of exploration, the cell with the highest deterministic return represents the method.
+    such as two kinds of exploration, the cell with the highest deterministic return represents the method. Runs of the
+    presets ``smoke`` and ``demo`` represent a method only in rows that have no other runs.
 
     Args:
         cells: Cells of any task and stage.
         place: Task and character.
     """
     candidates = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
+    earnest = [cell for cell in candidates if not cell.runs[0].preset.startswith(("smoke", "demo"))]
+    candidates = earnest or candidates
     best = {}
     for method, alike in grouped(candidates, lambda cell: cell.method).items():
         steps = (max if method == "scratch" else min)(cell.steps for cell in alike)

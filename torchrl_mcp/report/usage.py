@@ -3,7 +3,6 @@
 import math
 
 from torchrl_mcp.evaluation.diagnostics import COLLAPSED
-from torchrl_mcp.evaluation.statistics import shared_means
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.results import Run
 
@@ -19,7 +18,7 @@ PARTS = {"gates": "primitive", "options": "option"}
 
 def diagnostics(cell: Cell, group: str) -> dict[str, float]:
     """Return the means over seeds of the diagnostics of ``gates`` or ``options``, except :func:`usage`."""
-    return shared_means([_diagnostics(run, group) for run in cell.complete], "usage_")
+    return cell.over_seeds(lambda run: _diagnostics(run, group), "usage_")
 
 
 def usage(run: Run, group: str) -> list[float]:

@@ -35,6 +35,7 @@ from torchrl_mcp.runs.requirements import require_settings
 from torchrl_mcp.runs.status import MANIFEST, overview, write_manifest
 from torchrl_mcp.runs.trust import targets, trusting
 from torchrl_mcp.training.run_folder import CONFIG, LOG
+from torchrl_mcp.values import shown
 
 QUIET = ["hydra/hydra_logging=none", "hydra/job_logging=none"]
 
@@ -118,7 +119,7 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
             settings would share a folder.
     """
     rows = rows_of(master)
-    params = [f"{key}={value}" for key, value in (master.benchmark.get("params") or {}).items()]
+    params = [f"{key}={shown(value)}" for key, value in (master.benchmark.get("params") or {}).items()]
     given = [line for line in master.hydra.overrides.task if not line.startswith(("benchmark=", "benchmark."))]
     overrides = OverridesParser.create(config_loader=loader).parse_overrides([*params, *given])
     choices = {override.get_key_element(): values(override) for override in overrides}
@@ -165,7 +166,7 @@ def expand(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mapping[str, Se
     [{'task': 'carry', 'seed': '0'}, {'task': 'carry', 'seed': '1'}]
     """
     for row in rows:
-        fixed = {key: [str(value) for value in row[key]] for key in row}
+        fixed = {key: [shown(value) for value in row[key]] for key in row}
         selected = {key: [value for value in fixed[key] if value in choices.get(key, fixed[key])] for key in row}
         further = {key: choice for key, choice in choices.items() if key not in row}
         for combination in product(*selected.values(), *further.values()):
@@ -179,7 +180,7 @@ def require_in_rows(rows: Sequence[Mapping[str, Sequence[str]]], choices: Mappin
         ValueError: If all rows have the key of a choice, but none has its value.
     """
     for key in (key for key in choices if all(key in row for row in rows)):
-        available = dict.fromkeys(str(value) for row in rows for value in row[key])
+        available = dict.fromkeys(shown(value) for row in rows for value in row[key])
         if unknown := [value for value in choices[key] if value not in available]:
             raise ValueError(
                 f"no row of the benchmark has {key}={','.join(unknown)}: give some of {','.join(available)}"

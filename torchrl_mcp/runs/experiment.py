@@ -117,8 +117,9 @@ def _rehearse(trainer: Trainer, cfg: DictConfig) -> None:
         return
     env = build.make_env(cfg, num_envs=1, seed=cfg.evaluation.seed, **cfg.evaluation.environment)
     require_specs(env)
-    with torch.random.fork_rng(devices=[]):
-        outcome = evaluate(trainer.agent.actor.policy, env, max_steps=1, device=trainer.agent.device)
+    device = trainer.agent.device
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        outcome = evaluate(trainer.agent.actor.policy, env, max_steps=1, device=device)
     episode_statistics(outcome, env.normalised_return)
     env.close()
 

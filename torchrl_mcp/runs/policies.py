@@ -130,12 +130,13 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> li
         path: Run folder, for its newest checkpoint, or checkpoint file.
         episodes: Number of episodes per clip.
         seed: Seed of the environments.
-        **kwargs: Arguments of the environments that replace the run's arguments.
+        **kwargs: Arguments of the environments, in addition to the run's settings for evaluations.
 
     Raises:
         ValueError: If there is no checkpoint, the checkpoint is damaged, or the task is not imitation.
     """
-    agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **kwargs)
+    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
+    agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **{**settings["environment"], **kwargs})
     return follow_each(agent.actor.policy, env)
 
 

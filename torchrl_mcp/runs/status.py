@@ -132,8 +132,16 @@ def _status(run: Path, total: int | None) -> Status:
 
 
 def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
-    """Write the runs of a benchmark and their environment steps to a file, which other processes read."""
-    steps = {os.path.relpath(run, path.parent): total for run, total in runs.items()}
+    """Add the runs of a benchmark and their environment steps to a file, which other processes read.
+
+    The file keeps the runs of earlier commands, which may have trained other parts of the benchmark.
+    """
+    try:
+        earlier = read_manifest(path) if path.exists() else {}
+    except UNREADABLE:
+        earlier = {}
+    folder = path.parent.resolve()
+    steps = {os.path.relpath(run.resolve(), folder): total for run, total in {**earlier, **runs}.items()}
     write_json(steps, path)
 
 
@@ -151,8 +159,9 @@ def status(run: Path, total: int | None = None) -> Status:
     last_return = last.get(NORMALISED_RETURN, math.nan)
     score = None if math.isnan(last_return) else last_return
     if (run / EVALUATION).exists():
-        score = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
-        return Status(run, "done", frames, total, speed, score)
+        evaluated = float(read_json(run / EVALUATION)["deterministic"]["normalised_return"])
+        if frames >= total:  # otherwise, the run is continued after an evaluation
+            return Status(run, "done", frames, total, speed, evaluated)
     if lock.holder(run):
         return Status(run, "running", frames, total, speed, score)
     if _is_saved(run, total) and not _plan(run)[1]:
@@ -209,10 +218,16 @@ def _name(run: Path, folder: Path) -> str:
     return os.path.relpath(run, folder)
 
 
-@cache
 def _plan(run: Path) -> tuple[int, int]:
     """Return the environment steps of a run, and the number of episodes of its final evaluation."""
-    config = read_config(run / CONFIG)
+    config = run / CONFIG
+    return _plan_in(config, config.stat().st_mtime_ns)
+
+
+@cache
+def _plan_in(path: Path, changed: int) -> tuple[int, int]:
+    """Return the plan in a configuration, which is read again when the file has changed."""
+    config = read_config(path)
     return int(config["training"]["total_frames"]), int(config.get("evaluation", {}).get("episodes", 0))
 
 

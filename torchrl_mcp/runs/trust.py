@@ -119,11 +119,11 @@ def read_config(path: Path) -> dict[str, Any]:
     """
     if path.stat().st_size > LARGEST:
         raise ValueError(f"{path} has more than {LARGEST} bytes: it cannot be a configuration")
-    text = path.read_text(encoding="utf-8")
     try:
+        text = path.read_text(encoding="utf-8")
         _require_plain(text, path)
         config = yaml.load(text, _Loader)
-    except (yaml.YAMLError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError, UnicodeDecodeError) as error:
         first = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"{path} is not a configuration: {first}") from error
     if not isinstance(config, dict):

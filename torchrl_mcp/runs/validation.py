@@ -31,6 +31,7 @@ def require_valid(cfg: DictConfig) -> None:
     if not wrong and (schedule := config["optimizer"].get("schedule")):
         wrong += _step_size_out_of_range(config["step_size"]["actor"], schedule)
     if not wrong:
+        wrong += _uneven_batch(config["training"], config.get("batch_factor", 1))
         wrong += _wrong_folders(str(config["run_dir"]), str(config["run_root"]))
     if wrong:
         raise ValueError("\n".join(wrong))
@@ -141,6 +142,25 @@ def _step_size_out_of_range(actor: float, schedule: Mapping[str, Any]) -> Iterat
         yield (
             f"step_size.actor={actor:g} must be from {low:g} (optimizer.schedule.min_lr) to {high:g} (step_size.max), "
             "the range of the schedule: change one of these settings"
+        )
+
+
+def _uneven_batch(training: Mapping[str, Any], factor: int) -> Iterator[str]:
+    """Yield an error message if a batch cannot be divided evenly among environments or into minibatches.
+
+    Args:
+        training: The settings ``training``.
+        factor: Factor on ``training.frames_per_batch``, the setting ``batch_factor`` of methods that have it.
+    """
+    frames = training["frames_per_batch"]
+    num_envs = training["num_envs"]
+    minibatch_size = training["minibatch_size"]
+    batch = frames * factor
+    if batch % num_envs or batch % minibatch_size:
+        product = "" if factor == 1 else f" times batch_factor={factor}"
+        yield (
+            f"training.frames_per_batch={frames}{product} must be a multiple of training.num_envs={num_envs} and of "
+            f"training.minibatch_size={minibatch_size}"
         )
 
 

@@ -63,7 +63,10 @@ class Stopwatch:
         self.seconds[section] = self.seconds.get(section, 0.0) + seconds
 
     def watch(self, section: str, module: nn.Module) -> None:
-        """Add the time of every forward pass of ``module`` to a section."""
+        """Add the time of every forward pass of ``module`` to a section.
+
+        On a GPU, this is only the time to start the forward pass, because the GPU computes asynchronously.
+        """
         starts: list[float] = []
         module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
         module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))

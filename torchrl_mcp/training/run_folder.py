@@ -94,17 +94,20 @@ def read_json(path: Path) -> dict[str, Any]:
     """Return the content of a JSON file.
 
     Raises:
-        ValueError: If the file is damaged, too large or nested too deeply, or is not a JSON object.
+        ValueError: If the file is damaged, too large or nested too deeply, or is not a JSON object; the message names
+            the file.
         OSError: If the file cannot be read.
     """
     if path.stat().st_size > LARGEST:
-        raise ValueError(f"the file has more than {LARGEST} bytes")
+        raise ValueError(f"{path} has more than {LARGEST} bytes: remove it, or restore it from a copy")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as error:
-        raise ValueError("the JSON is nested too deeply") from error
+        raise ValueError(f"{path} is nested too deeply: remove it, or restore it from a copy") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}. Remove it, or restore it from a copy") from error
     if not isinstance(content, dict):
-        raise ValueError("the JSON is not an object")
+        raise ValueError(f"{path} is not a JSON object: remove it, or restore it from a copy")
     return content
 
 

@@ -35,7 +35,7 @@ def side_by_side(tasks: Mapping[str, Callable[[], Result]]) -> dict[str, Result]
     each other after each operation, and Python's work for one network overlaps with the products of the other.
 
     Args:
-        tasks: Functions by name. The functions must not draw random numbers or change shared data.
+        tasks: Functions by name. At most one function may draw random numbers, and none may change shared data.
 
     Returns:
         The result of each task, by name.

@@ -124,7 +124,7 @@ class Trainer:
         save(self.checkpoint, self.folder.checkpoints, step=self.progress.frames, config=self.folder.config)
 
     def _behaviour(self) -> TensorDictModuleBase:
-        """Return the policy for collection, which writes only the keys that the loss reads."""
+        """Return the policy for collection, which writes only the keys that the losses and the diagnostics read."""
         actor = self.agent.actor
         needed = {"action", actor.log_prob, *actor.stored}
         keys = [key for key in dict.fromkeys(actor.policy.out_keys) if key in needed]

@@ -59,7 +59,9 @@ def require_parts(parts: nn.ModuleDict, names: Iterable[str], argument: str) -> 
 
 
 def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Collection[str]) -> None:
-    """Check that frozen networks see the inputs of their pre-training, and that the critic is not frozen.
+    """Check that frozen networks see states as in their pre-training, and that the critic is not frozen.
+
+    The normaliser of goals is not checked, although it changes the outputs of a frozen network that reads the goal.
 
     Args:
         parts: All parts of an agent by name.
@@ -67,7 +69,7 @@ def require_frozen_input(parts: nn.ModuleDict, keep: Collection[str], freeze: Co
         freeze: Parts that do not change.
 
     Raises:
-        ValueError: If the input normaliser of frozen networks is not frozen too, if it is not kept although frozen
+        ValueError: If the normaliser of states is not frozen although networks are, if it is not kept although frozen
             networks are, or if the critic is frozen.
     """
     if "critic" in freeze:

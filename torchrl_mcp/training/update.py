@@ -240,7 +240,10 @@ def _divergence(reports: list[TensorDictBase]) -> float:
 
 
 def _spread(distribution: Distribution) -> dict[str, float]:
-    """Return the mean entropy of a choice among options, or the mean standard deviation of an action."""
+    """Return the mean entropy of a choice among options, or the mean standard deviation of the sampled variable.
+
+    The sampled variable is the action, the logits of the gate or the latent variable.
+    """
     if isinstance(distribution, Categorical):
         return {"policy/entropy": distribution.entropy().mean().item()}
     return {"policy/std": distribution.stddev.mean().item()}

@@ -63,6 +63,7 @@ REFUSED = [
     (Imitation, {"switch_candidates": 0}, "switch_candidates=0"),
     (Imitation, {"switch_to": "other"}, "switch_to='other'"),
     (Imitation, {"clip_end": "loop"}, "clip_end='loop'"),
+    (Imitation, {"curriculum": {"random_first_length": True}}, "curriculum"),
     (Imitation, {"terms": {}}, "terms"),
     (Imitation, {"terms": {"posture": POSE}}, "'posture'"),
     (Imitation, {"terms": {"pose": {"weight": 1.0, "scales": 2.0}}}, "scales"),

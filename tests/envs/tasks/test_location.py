@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchrl_mcp.envs import Location
+from torchrl_mcp.envs.steering import UserGoal
 from torchrl_mcp.envs.tasks.rewards import location_reward
 from torchrl_mcp.envs.tasks.waypoints import walkable
 
@@ -246,6 +247,15 @@ def test_the_arrow_points_down_to_the_place_and_another_where_to_face():
     np.testing.assert_allclose(tail, [*target, 1.0])
     assert math.atan2(*(front - back)[1::-1]) == pytest.approx(1.0)
     assert len(make(1).arrows(0)) == 1
+
+
+def test_a_snapshot_keeps_a_place_that_the_user_set():
+    env = make(1)
+    env.reset()
+    env.steer(UserGoal(place=(2.0, -1.0)))
+    state = env.get_state()
+    env.reset(state, set_state=True)
+    assert env.episode["target"][0].tolist() == [2.0, -1.0]
 
 
 def test_a_snapshot_keeps_the_place():
