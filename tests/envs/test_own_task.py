@@ -5,7 +5,7 @@ import torch
 from refusals import refused
 from tensordict import TensorDict
 
-from torchrl_mcp.envs import Carry, Heading, Location, PDCharacterEnv
+from torchrl_mcp.envs import Carry, Heading, Holdout, Location, PDCharacterEnv
 from torchrl_mcp.envs.motions.single import single_motion
 
 
@@ -51,22 +51,24 @@ def test_a_reward_or_an_end_of_another_shape_is_named(method):
     refused(lambda: step(wrong()), f"Wrong.{method}()", "(3, 1)", "(3,)")
 
 
-def test_an_end_that_the_task_keeps_for_the_episode_stays_in_the_step_that_ended_it():
-    class Ends(Stand):
-        def __init__(self):
-            super().__init__(finished=False, episode={"ended": torch.zeros((), dtype=torch.bool)})
-            self.make_specs()
+def test_an_end_that_the_task_stores_stays_in_the_step_that_it_ended():
+    class Ends(Holdout):
+        ended = torch.zeros(2, dtype=torch.bool)
+
+        def initial_state(self, num):
+            self.ended[:] = False
+            return super().initial_state(num)
 
         def after_step(self, diverged):
-            self.episode["ended"][:] = True
+            self.ended[:] = True
 
         def terminated(self):
-            return self.episode["ended"]
+            return self.ended
 
-    env = Ends()
+    env = Ends(num_envs=2, directions=(0.0, 1.0), seed=0, num_threads=1)
     outcome, _ = env.step_and_maybe_reset(env.reset().set("action", torch.zeros(env.action_spec.shape)))
     assert outcome["next", "terminated"].all()
-    assert not env.episode["ended"].any()  # the next episodes have begun
+    assert not env.ended.any()  # the next episodes have begun
 
 
 @pytest.mark.parametrize(
