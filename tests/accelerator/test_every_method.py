@@ -53,7 +53,8 @@ def test_gradient_steps_do_not_wait_for_the_accelerator(rehearsal):
     # Separate options split their samples by the option that acts, whose numbers the processor must know.
     splits = GRADIENT_STEPS + 1 if method == "hierarchical" else 0
     if method != "scratch":
-        entropies = GRADIENT_STEPS  # imitation has an entropy bonus, and TorchRL's loss checks that it is finite
+        # MOE's imitation has an entropy bonus, and TorchRL's loss checks that it is finite.
+        entropies = GRADIENT_STEPS if method == "moe" else 0
         assert found["waits of pretrain"]["update"] == WAITS_PER_UPDATE + splits + entropies
         assert found["waits of pretrain"]["other"] <= WAITS_BESIDES
     waits = WAITS_OF_CRITIC if method == "option_critic" else WAITS_PER_UPDATE  # its options are frozen at transfer
