@@ -322,9 +322,9 @@ class Imitation(PDCharacterEnv):
                 linear, angular = (qvel - reference.qvel)[:, :6].square().split(3, -1)
                 return linear.sum(-1) + 0.1 * angular.sum(-1)
             case "key_positions":
-                own = positions[:, self._keys] - positions[:, :1]
-                target = targets[:, self._keys] - targets[:, :1]
-                return squared_distances(own, target).mean(-1)
+                offsets = positions[:, self._keys] - positions[:, :1]
+                target_offsets = targets[:, self._keys] - targets[:, :1]
+                return squared_distances(offsets, target_offsets).mean(-1)
             case "bodies":
                 return squared_distances(positions, targets).mean(-1)
             case "orientations":

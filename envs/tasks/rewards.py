@@ -176,9 +176,13 @@ def transport_reward(
     ways = torch.stack([position - com, target - position])
     towards = torch.nn.functional.normalize(ways, dim=-1)  # 0 for a zero vector
     missing_speeds = ((towards * torch.stack([com_velocity, velocity])).sum(-1) - speed).clamp(max=0.0)
-    cv, bv = missing_speeds.square()
-    cp, bp = ways.square().sum(-1)
-    exponents = torch.stack([-1.5 * cv, -proximity_scale * cp, -bv, -0.5 * bp.pow(target_distance_power / 2)], -1)
+    squared_gaps = missing_speeds.square()
+    squared_distances = ways.square().sum(-1)
+    cv = -1.5 * squared_gaps[0]
+    cp = -proximity_scale * squared_distances[0]
+    bv = -squared_gaps[1]
+    bp = -0.5 * squared_distances[1].pow(target_distance_power / 2)
+    exponents = torch.stack([cv, cp, bv, bp], -1)
     return exponents.exp() @ _on(exponents.device, tuple(weights)).to(exponents.dtype)
 
 

@@ -661,7 +661,7 @@ FAULTS = {
     ],
     "torchrl_mcp/report/table_2.py": [
         ('(max if method == "scratch" else min)', "min", "report/test_table_2.py"),
-        ("candidates = earnest or candidates", "pass", "report/test_table_2.py"),
+        ("candidates = full or candidates", "pass", "report/test_table_2.py"),
     ],
     "torchrl_mcp/report/comparison.py": [
         ("set() if _explores(run) else", "set() if True else", "report/test_comparison.py report/test_cell.py"),

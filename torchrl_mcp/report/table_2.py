@@ -36,8 +36,8 @@ def compared(cells: Iterable[Cell], place: Place) -> dict[str, Cell]:
         place: Task and character.
     """
     candidates = [c for c in cells if c.place == place and c.stage == "transfer" and c.is_standard and c.complete]
-    earnest = [cell for cell in candidates if not cell.runs[0].preset.startswith(("smoke", "demo"))]
-    candidates = earnest or candidates
+    full = [cell for cell in candidates if not cell.runs[0].preset.startswith(("smoke", "demo"))]
+    candidates = full or candidates
     best = {}
     for method, alike in grouped(candidates, lambda cell: cell.method).items():
         steps = (max if method == "scratch" else min)(cell.steps for cell in alike)

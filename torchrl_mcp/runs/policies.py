@@ -1,6 +1,7 @@
 """Restores, evaluates and publishes trained policies."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -109,8 +110,7 @@ def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[s
     Raises:
         ValueError: If there is no checkpoint, or the checkpoint is damaged.
     """
-    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
-    environment = {**settings["environment"], **kwargs}
+    environment = _evaluation_environment(path, kwargs)
     results: dict[str, Any] = {"episodes": episodes, "seed": seed, "environment": environment}
     for mode in MODES:
         _, agent, env = restore(path, num_envs=episodes, seed=seed, **environment)
@@ -135,9 +135,15 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> li
     Raises:
         ValueError: If there is no checkpoint, the checkpoint is damaged, or the task is not imitation.
     """
-    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
-    agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **{**settings["environment"], **kwargs})
+    environment = _evaluation_environment(path, kwargs)
+    agent, env = restore_for_clips(path, episodes=episodes, seed=seed, **environment)
     return follow_each(agent.actor.policy, env)
+
+
+def _evaluation_environment(path: Path, further: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of environments in evaluations of a run, and further arguments, which replace them."""
+    settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
+    return {**settings["environment"], **further}
 
 
 def restore_for_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> tuple[Agent, Imitation]:
