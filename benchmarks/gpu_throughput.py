@@ -27,6 +27,7 @@ from typing import Any
 
 import torch
 from report import about, table, write
+from scaling import Record
 
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.envs.characters import CHARACTERS
@@ -76,7 +77,7 @@ def measure(scene: str, physics: str, num_envs: int, device: str, threads: int, 
     trainer.folder.metrics = record  # type: ignore[assignment]
     trainer.save = lambda: None  # type: ignore[method-assign]
     trainer.run()
-    training = sum(samples / speed for speed in record.speeds[1:])
+    training = sum(samples / iteration["time/steps_per_second"] for iteration in record.rows[1:])
     return {
         "steps": round(num_envs * steps / seconds),
         "samples": round(samples * iterations / training),
@@ -100,17 +101,6 @@ def wait(device: torch.device) -> None:
     """Wait until the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-class Record:
-    """A metrics writer that stores the speed of each iteration."""
-
-    def __init__(self) -> None:
-        self.speeds: list[float] = []
-
-    def write(self, metrics: dict[str, float], *, step: int) -> None:
-        """Store a speed."""
-        self.speeds.append(metrics["time/steps_per_second"])
 
 
 def row(scene: str, physics: str, num_envs: int, *settings: Any) -> dict[str, Any]:

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from report import about, table, write
@@ -41,6 +40,7 @@ from torchrl_mcp.envs import Heading
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import experiment, policies
 from torchrl_mcp.runs.builtin import builtin
+from torchrl_mcp.runs.configuration import compose_run
 from torchrl_mcp.training import run_folder
 
 RESULTS = Path(__file__).resolve().parent / "results" / "off_policy.csv"
@@ -190,9 +190,9 @@ def sac_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
 
 def ppo_rows(seed: int, size: Size) -> Iterator[dict[str, Any]]:
     """Train by this library's PPO, and yield a row for every checkpoint, with seconds in proportion to its steps."""
-    with TemporaryDirectory() as folder, initialize_config_module("torchrl_mcp.conf", version_base="1.3"):
+    with TemporaryDirectory() as folder:
         counts = (f"training.total_frames={size.ppo}", f"training.num_envs={size.num_envs}")
-        cfg = compose("train", [*PPO.split(), *counts, f"seed={seed}", f"run_dir={folder}/run"])
+        cfg = compose_run(*PPO.split(), *counts, f"seed={seed}", f"run_dir={folder}/run")
         began = time.process_time()
         run = experiment.train(cfg)
         seconds = time.process_time() - began

@@ -1,6 +1,6 @@
 """Archives the runs of Table 2, and writes tables, pictures and learning curves of the seven methods.
 
-    torchrl-mcp-train benchmark=table2 preset=comparison run_root=runs/table2
+    torchrl-mcp-train benchmark=table2 preset=comparison autocast=false run_root=runs/table2
     python benchmarks/table2.py runs/table2    # archives the complete runs, and writes the results
     python benchmarks/table2.py                # writes the results again, from the archive
 

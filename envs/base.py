@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_mcp.adapters.contract import Reach
+from torchrl_mcp.adapters.contract import Reach, entry_names
 from torchrl_mcp.envs.characters.mirror import Mirror
 from torchrl_mcp.envs.physics.engines import Engine, named
 from torchrl_mcp.envs.physics.simulation import LARGEST
@@ -496,5 +496,5 @@ class CharacterEnv(EnvBase):
     @property
     def metric_names(self) -> dict[str, list[str]]:
         """Observations that are metrics and not inputs of the policy: the names of the entries of each key."""
-        widths = {key: value.shape[-1] for key, value in self._observed.items() if key not in ("observation", "goal")}
-        return {key: [key] if n == 1 else [f"{key}_{i}" for i in range(n)] for key, n in widths.items()}
+        sizes = {key: value.shape[-1] for key, value in self._observed.items() if key not in ("observation", "goal")}
+        return entry_names(sizes)

@@ -112,7 +112,7 @@ def _dtype(spec: TensorSpec) -> type[np.floating]:
     return np.float64 if spec.dtype is torch.float64 else np.float32
 
 
-def make(task: str, character: str, *, seed_of_motions: int = 0, **kwargs: Any) -> GymnasiumEnv:
+def make(task: str, character: str, **kwargs: Any) -> GymnasiumEnv:
     """Return an environment that Gymnasium knows by name, with the defaults of its task.
 
     Holdout has all directions, and imitation follows the generated motions with the reward of ``imitation=fast``.
@@ -120,7 +120,6 @@ def make(task: str, character: str, *, seed_of_motions: int = 0, **kwargs: Any) 
     Args:
         task: Name of the task's class.
         character: Name of the character.
-        seed_of_motions: Seed of the generated motions.
         **kwargs: Passed on to :class:`GymnasiumEnv`.
     """
     kind = getattr(envs, task)
@@ -128,6 +127,6 @@ def make(task: str, character: str, *, seed_of_motions: int = 0, **kwargs: Any) 
         return GymnasiumEnv(kind, **{"directions": (0.0, 2 * math.pi), **kwargs})
     if task == "Imitation":
         terms = yaml.safe_load(files("torchrl_mcp.conf").joinpath("imitation/fast.yaml").read_text())["terms"]
-        clips = kwargs.pop("clips", None) or generated_library(character, seed_of_motions)
+        clips = kwargs.pop("clips", None) or generated_library(character, seed=0)
         kwargs = {"clips": clips, "terms": terms, **kwargs}
     return GymnasiumEnv(kind, character=character, **kwargs)

@@ -36,7 +36,7 @@ def transport_reach(
         timestep: Duration of a step in seconds.
         num_steps: Steps of the episode.
         success_distance: Metres between object and target below which the reward is 1; 0 for none.
-        success_reach: Metres between player and object below which it is.
+        success_reach: Metres between player and object below which a success counts; infinity for no limit.
     """
 
     def reward_of(*state: Tensor) -> Tensor:

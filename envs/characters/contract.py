@@ -71,6 +71,8 @@ def violations(
         sides: Beginnings or ends of bodies' names, right and left.
     """
     model = spec.compile()
+    if model.nbody == 1:
+        return [Violation("has no body", "give it a root with a free joint, and links that the root carries")]
     named = {"feet": feet, "key_bodies": key_bodies, "carrier": [carrier] if carrier else []}
     faults = [
         *_scenery(model),
@@ -197,7 +199,7 @@ def _root(model: mujoco.MjModel) -> Iterator[Violation]:
     roots = np.flatnonzero(model.body_parentid[1:] == 0) + 1
     if len(roots) != 1:
         yield Violation(f"has {len(roots)} bodies that are attached to the world", "let one root carry all others")
-    if model.nbody > 1 and kinds_of(model, 1) != [FREE]:
+    if kinds_of(model, 1) != [FREE]:
         yield Violation(f"the root {model.body(1).name} must have a free joint and no other", "give it one freejoint")
 
 

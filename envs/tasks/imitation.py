@@ -162,8 +162,6 @@ class Imitation(PDCharacterEnv):
         self._masses = masses.to(self.device)
         self._centres_of_mass = centres.to(self.device)
         self.make_specs()
-        for name in self.terms:
-            self._error(name, self._next)
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on a scale where 0 is the worst possible and 1 the best, :math:`R / (T \sum_i w_i)`."""

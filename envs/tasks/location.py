@@ -17,7 +17,7 @@ from torchrl_mcp.envs.rotations import unit_vector
 from torchrl_mcp.envs.steering import Steerable, UserGoal
 from torchrl_mcp.envs.tasks.places import ANY_DIRECTION, LOGARITHMIC, logarithmic, near, steps
 from torchrl_mcp.envs.tasks.ranges import Ranges
-from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward
+from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, location_reward, location_velocity
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, walkable, way
 from torchrl_mcp.values import Count, NotNegative, Positive, Range, checked, require
 
@@ -192,8 +192,9 @@ class Location(PDCharacterEnv):
         offset = self._offset()
         standing = self.max_episode_steps * location_reward(still, offset, self.speed, self._alignment())
         times = torch.arange(1, self.max_episode_steps + 1, device=self.device) * self.control_timestep
-        left = (torch.linalg.vector_norm(offset, dim=-1, keepdim=True) - self.speed * times).clamp(min=0.0)
-        return Reach(standing, (0.6 + 0.4 * (-left.square()).exp()).sum(-1))
+        distance = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+        left = (1 - self.speed * times / distance).clamp(min=0.0).unsqueeze(-1) * offset.unsqueeze(1)
+        return Reach(standing, location_reward(location_velocity(left, self.speed), left, self.speed).sum(-1))
 
     def goal_mirror(self) -> Mirror:
         """See :meth:`PDCharacterEnv.goal_mirror`."""

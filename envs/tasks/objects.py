@@ -13,7 +13,8 @@ from torchrl_mcp.envs.physics.simulation import Simulation
 class SceneObject:
     """A body of the scene with live views of its pose in N simulations, made once.
 
-    It moves freely, by joints with the coordinates of a free joint, or where it is put, as a mocap body.
+    The object either moves freely, by joints with the coordinates of a free joint, or stays where it is put, as a mocap
+    body.
 
     Args:
         simulation: The simulations.

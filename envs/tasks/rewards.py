@@ -61,8 +61,7 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     r"""Reward of the location task: go to a place, and stand there.
 
     .. math::
-        r &= 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 \|v_{com} - v^*\|^2) \\
-        v^* &= \frac{x}{\|x\|} \min(\hat{v}, \|x\| / 1 \text{ s}) \text{, and 0 for } \|x\| < 0.3 \text{ m}
+        r = 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 \|v_{com} - v^*\|^2)
 
     The second term guides the character from any distance, where the first is flat. In the last metre it asks for a
     velocity that falls with the distance, and at the place for standing still. Motion across counts, because a
@@ -79,10 +78,22 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     Returns:
         Reward, shape ``(*B)``.
     """
+    towards = velocity_reward(velocity, location_velocity(offset, speed))
+    return 0.4 * (-offset.square().sum(-1)).exp() * (1 + alignment) / 2 + 0.6 * towards
+
+
+def location_velocity(offset: Tensor, speed: float) -> Tensor:
+    r"""Target velocity :math:`v^*` of the location task, shape ``(*B, 2)``, in m/s.
+
+    .. math:: v^* = \frac{x}{\|x\|} \min(\hat{v}, \|x\| / 1 \text{ s}) \text{, and 0 for } \|x\| < 0.3 \text{ m}
+
+    Args:
+        offset: The place relative to the centre of mass :math:`x`, shape ``(*B, 2)``, in metres.
+        speed: Speed far from the place :math:`\hat{v}`, in m/s.
+    """
     distance = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
     wanted = distance.clamp(max=speed) * (distance >= ARRIVAL_DISTANCE)
-    towards = velocity_reward(velocity, torch.nn.functional.normalize(offset, dim=-1) * wanted)
-    return 0.4 * (-distance.squeeze(-1).square()).exp() * (1 + alignment) / 2 + 0.6 * towards
+    return torch.nn.functional.normalize(offset, dim=-1) * wanted
 
 
 def holdout_reward(

@@ -12,7 +12,7 @@ from torchrl_mcp.envs.tasks.places import logarithmic, near, steps
 from torchrl_mcp.envs.tasks.rewards import ARRIVAL_DISTANCE, SUCCESS_DISTANCE, SUCCESS_REACH
 
 STRIDE = 1.0
-"""Largest distance in metres of the next place while a character carries: the further it is, the faster they walk."""
+"""Largest distance in metres of the next place while carrying: the further the place, the faster the walk."""
 
 WALK_AHEAD = 1.5
 """Seconds of walking at the target speed to a place ahead: at every step of speed it is beyond arrival."""
@@ -21,16 +21,16 @@ PUSH = 0.5
 """Distance in metres to walk behind a ball and to the side of it, and the largest beyond it."""
 
 SHARE = 0.1
-"""Distance to walk beyond a ball, as a share of its distance from the target: the further, the faster they walk."""
+"""Distance to walk beyond a ball, as a share of the ball's distance from the target: the further, the faster."""
 
 BEHIND = 0.7
 """Cosine of the angle between the ways to ball and target, above which a character is behind the ball."""
 
 ASIDE = math.radians(45)
-"""Largest angle in radians from its heading at which a character sees a place that it goes to."""
+"""Largest angle in radians between a character's heading and the place to which it goes."""
 
 STEP = 0.5
-"""Distance in metres of a place that it sees at this angle."""
+"""Distance in metres of a place that is shown at the angle :data:`ASIDE`."""
 
 
 def place_ahead(com: Tensor, velocity: Tensor) -> Tensor:
@@ -49,7 +49,8 @@ def place_ahead(com: Tensor, velocity: Tensor) -> Tensor:
 def carry_waypoint(com: Tensor, box: Tensor, target: Tensor, taken: Tensor, held: Tensor) -> Tensor:
     """The box, then on the way on which the box in hand comes to the target, then where the character stands.
 
-    The way ends :data:`ARRIVAL_DISTANCE` past the target, because a gate that goes to places stops so much before them.
+    The way ends :data:`ARRIVAL_DISTANCE` past the target, because a gate for
+    :class:`.Location` stops that far before a place.
 
     Args:
         com: Centre of mass of the character, ``(N, 2)``, in metres.

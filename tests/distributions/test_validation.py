@@ -96,13 +96,22 @@ def test_validation_follows_torch_s_default_unless_told(distribution_class, defa
     if default:
         refused(lambda: distribution_class(**bad), "gates")
     else:
-        distribution_class(**GOOD | {"scale": -torch.ones(3, 2)})
+        distribution_class(**GOOD | {"loc": torch.full((3, 2), torch.nan)})
 
 
-def test_raw_logits_are_refused_with_the_remedy_where_validation_is_off_by_default(distribution_class, monkeypatch):
+def test_raw_outputs_are_refused_with_the_remedy_where_validation_is_off_by_default(distribution_class, monkeypatch):
     monkeypatch.setattr(Distribution, "_validate_args", False)
     logits = torch.tensor([[0.3, -0.7, 1.0], [0.2, 0.1, 0.5]])
     refused(lambda: distribution_class(**GOOD | {"gates": logits}), "gates of shape (2, 3)", "sigmoid")
+    scale = torch.tensor([[0.3, 0.2], [0.1, -0.5], [0.5, 0.6]])
+    refused(lambda: distribution_class(**GOOD | {"scale": scale}), "scale of shape (3, 2) contains -0.5", "softplus")
+
+
+def test_a_product_under_raw_logits_is_nan_where_signs_are_not_checked():
+    loc, scale = torch.tensor([[0.0], [3.0]]), torch.ones(2, 1)
+    composite = MultiplicativeGaussian(loc, scale, torch.tensor([-2.0, 1.0]), validate_args=False)
+    assert composite.mean.isnan().all()
+    assert composite.log_prob(torch.zeros(1)).isnan().all()
 
 
 class Operations(TorchDispatchMode):

@@ -10,7 +10,7 @@ from torch.distributions import Independent, Laplace
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import NormalParamExtractor
 
-from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian
+from torchrl_mcp.distributions import AdditiveGaussian, MultiplicativeGaussian, TanhMultiplicativeGaussian
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.mcp import composite_actor, composite_parts
 from torchrl_mcp.modules import JointGating, Primitives
@@ -203,3 +203,8 @@ class WithoutDeviation(WithoutAction):
 )
 def test_a_mixer_that_lacks_a_property_is_refused_before_training(mixer, property_name, composite):
     refused(lambda: composite(**HEADS | {"distribution_class": mixer}), mixer.__name__, property_name)
+
+
+def test_a_mixer_whose_noise_is_not_proportional_to_that_of_its_primitives_is_refused(composite):
+    mixer = TanhMultiplicativeGaussian
+    refused(lambda: composite(**HEADS | {"distribution_class": mixer}), mixer.__name__, "proportional")

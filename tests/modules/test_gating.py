@@ -116,6 +116,12 @@ def test_diagnostics_are_scalars_for_any_batch_and_carry_no_gradient():
     assert gate_diagnostics(torch.tensor([0.25, 0.75]))["sum"] == 1
 
 
+@pytest.mark.parametrize("gate", [Gating, JointGating])
+@pytest.mark.parametrize("num_primitives", [0, 2.5])
+def test_a_gate_over_an_impossible_number_of_primitives_is_refused(gate, num_primitives):
+    refused(lambda: gate(3, 2, num_primitives), f"num_primitives={num_primitives}")
+
+
 @pytest.mark.parametrize("num_cells", [(), [], 64])
 def test_a_gate_without_a_list_of_layers_is_refused(num_cells):
     refused(lambda: JointGating(3, 2, 4, num_cells=num_cells), f"num_cells={num_cells}")

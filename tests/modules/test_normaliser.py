@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -78,7 +80,9 @@ def test_it_has_no_parameters_and_its_statistics_take_no_gradient():
     assert x.grad.ne(0).all()
 
 
-@pytest.mark.parametrize(("name", "value"), [("size", -1), ("clip", 0.0), ("clip", -1.0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("size", -1), ("clip", 0.0), ("clip", -1.0), ("clip", math.nan), ("epsilon", -1.0)]
+)
 def test_impossible_arguments_are_refused_by_name(name, value):
     refused(lambda: RunningNormaliser(**{"size": 3, name: value}), name)
 

@@ -113,13 +113,6 @@ def test_the_tasks_of_a_character_share_the_pretraining_of_their_method_and_seed
         assert f"pretrained={source.folder}" in job.overrides
 
 
-def test_all_seeds_may_share_one_pretraining(tmp_path):
-    arguments = ["task=heading", "character=biped", "method=mcp", "seed=1,2", "benchmark.pretrain_seed=0"]
-    source, *transfers = jobs_of("benchmark=table2", f"run_root={tmp_path}", *arguments)
-    assert (source.config["stage"]["name"], source.config["seed"]) == ("pretrain", 0)
-    assert [(job.config["seed"], job.needs) for job in transfers] == [(1, source.folder), (2, source.folder)]
-
-
 def test_every_method_of_a_comparison_takes_as_many_steps(tmp_path):
     arguments = ["task=heading", "character=biped", "preset=comparison", "seed=0"]
     jobs = {job.folder: job for job in jobs_of("benchmark=table2", f"run_root={tmp_path}", *arguments)}

@@ -47,6 +47,19 @@ def test_a_published_policy_acts_as_the_run_does_up_to_the_precision_of_bfloat16
     assert (act(published) != act(run)).any()
 
 
+def test_a_folder_may_be_a_string(run):
+    assert policies.evaluation(str(run), episodes=2, seed=0) == policies.evaluation(run, episodes=2, seed=0)
+    assert experiment.resume(str(run)) == run
+
+
+def test_primitives_of_another_mixer_are_named(run, tmp_path):
+    additive = ["task=heading", "stage=transfer", "mixer=additive", "std_gain=0.5"]
+    cfg = configure(tmp_path / "run", *BIPED[:2], *additive, f"pretrained={run}")
+    env = build.make_env(cfg, num_envs=1, seed=0)
+    with pytest.warns(UserWarning, match="pre-trained with mixer=multiplicative, and mixer=additive"):
+        build.make_agent(cfg, env, checkpoint.find(run))
+
+
 def test_the_values_that_choose_options_are_published_and_needed(tmp_path):
     run = experiment.train(configure(tmp_path / "run", "method=option_critic", *BIPED[1:], "training.total_frames=128"))
     policies.publish_run(run, tmp_path / "with.torchrl")

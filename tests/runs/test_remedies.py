@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from refusals import refused
 
 from torchrl_mcp import conf
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs import build, experiment, imports, requirements
 from torchrl_mcp.runs.configuration import compose_run
 
@@ -24,6 +25,8 @@ WITHOUT_CUDA = pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is ava
     [
         pytest.param(["device=cuda"], ["device=cuda", "device=cpu"], marks=WITHOUT_CUDA),
         (["device=mps"], ["device=mps"]),
+        (["device=meta"], ["device=meta"]),
+        (["mixer.name=additive"], ["mixer.name=additive", "MultiplicativeGaussian"]),
         (["logger=wandb"], ["logger=wandb", "torchrl-mcp[wandb]"]),
         (["logger=mlflow"], ["logger=mlflow", "torchrl-mcp[mlflow]"]),
         ([*HEADING], ["pretrained=builtin"]),
@@ -62,6 +65,11 @@ def test_where_a_pretraining_is_missing_the_benchmarks_that_run_both_stages_are_
     assert any({"scratch", "mcp"} <= set(row.method) for row in rows)
 
 
+def test_a_wrong_setting_to_which_others_refer_is_named_once(tmp_path):
+    message = refused(lambda: experiment.train(configure(tmp_path, "width=nan")), "width=nan", untouched=tmp_path)
+    assert message.count("width") == 1
+
+
 @pytest.mark.parametrize(("module", "written"), [("calendar", True), ("calendar", False), ("yaml", True)])
 def test_a_module_of_ones_own_with_the_name_of_another_is_refused_by_its_name(tmp_path, monkeypatch, module, written):
     monkeypatch.chdir(tmp_path)
@@ -85,6 +93,45 @@ def test_a_module_of_ones_own_is_taken_from_the_working_directory(tmp_path, monk
     Path("mine_alone.py").write_text("MINE = True")
     imports.import_own("mine_alone", "character=x is in the module")
     assert sys.modules.pop("mine_alone").MINE
+
+
+TASK = """
+from torchrl_mcp.envs import Heading
+
+class Approach(Heading):
+    def __init__(self, *args, radius=1.0, **kwargs):
+        super().__init__(*args, **kwargs)
+"""
+
+
+def test_a_misspelt_argument_of_a_task_of_ones_own_is_refused_with_the_argument_that_it_takes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("approach_task.py").write_text(TASK)
+    own = [*HEADING, *SCRATCH, "task.transfer._target_=approach_task.Approach", "+task.transfer.radus=1.0"]
+    refused(lambda: experiment.train(configure(tmp_path, *own)), "task.transfer.radus", "radius")
+
+
+CHARACTER = """
+from dataclasses import replace
+from pathlib import Path
+
+from torchrl_mcp.envs import characters
+
+biped = characters.CHARACTERS["biped"]
+body = Path(characters.__file__).with_name("biped.xml")
+characters.CHARACTERS["footless"] = replace(biped, name="footless", feet=(), file=body)
+"""
+
+
+def test_a_character_of_ones_own_that_breaks_the_rules_is_named_with_the_rule(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(CHARACTERS, "footless", None)  # is removed after the test
+    Path("footless_body.py").write_text(CHARACTER)
+    cfg = configure(tmp_path, *HEADING, *SCRATCH, "character.name=footless", "+character.module=footless_body")
+    with pytest.warns(UserWarning, match="character=footless breaks rules.*no feet are named"):
+        imports.require_environment(cfg)
 
 
 @pytest.fixture

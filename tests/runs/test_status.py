@@ -104,7 +104,7 @@ def test_the_table_shows_what_runs_first_and_counts_what_it_leaves_out(runs):
     console = Console(file=io.StringIO(), width=120)
     console.print(table(look(runs), runs, height=2))
     lines = console.file.getvalue().splitlines()
-    assert lines[1].split() == ["alive", "running", "400/1,000", "50", "0.250", "0", "min"]
+    assert lines[1].split() == ["alive", "running", "400/1,000", "50", "0.250", "12", "s"]
     assert lines[2].split()[:2] == ["killed", "stopped"]
     assert "1 running, 1 stopped, 1 done, 1 waiting; 2 not shown" in lines[3]
 

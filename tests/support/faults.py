@@ -77,6 +77,7 @@ FAULTS = {
         ("(precisions * loc).sum(-2)", "(precisions * loc).mean(-2)", "distributions/test_multiplicative.py"),
         ("gates.unsqueeze(-1) * scale", "scale", "distributions/test_multiplicative.py"),
         (".clamp_min(MIN_SCALE)", "", "distributions/test_multiplicative.py"),
+        ("total < 0, torch.nan", "total < 0, 1.0", "distributions/test_validation.py"),
     ],
     "torchrl_mcp/distributions/additive.py": [
         ("(gates * function(actions)).sum(0)", "function(actions).mean(0)", "distributions/test_additive.py"),
@@ -90,7 +91,8 @@ FAULTS = {
     "torchrl_mcp/distributions/primitives.py": [
         ("(gates >= 0)", "(gates > 0)", "distributions/test_validation.py"),
         ("(scale > 0)", "(scale >= 0)", "distributions/test_validation.py"),
-        ("negative = gates < 0", "negative = gates < -1", "distributions/test_validation.py"),
+        ("negative = value < 0", "negative = value < -1", "distributions/test_validation.py"),
+        ("check_signs(scale, gates)", "check_signs(gates, gates)", "distributions/test_validation.py"),
         ("if gates.shape[-1] != shape[-2]", "if False", "distributions/test_validation.py"),
     ],
     "torchrl_mcp/modules/gating.py": [
@@ -457,13 +459,13 @@ FAULTS = {
     ],
     "torchrl_mcp/evaluation/rollout.py": [
         (
-            "reward.squeeze(-1) * running",
-            "reward.squeeze(-1)",
+            "reward * running",
+            "reward",
             "evaluation/test_rollout.py",
         ),
         (
-            '(flag & ~outcome["terminated"])',
-            "flag",
+            "measured[SUCCESS] & ~terminated",
+            "measured[SUCCESS]",
             "evaluation/test_rollout.py envs/tasks/test_transport_success.py",
         ),
         (
@@ -472,8 +474,8 @@ FAULTS = {
             "evaluation/test_rollout.py",
         ),
         (
-            "means = {key: total / lengths.unsqueeze(-1)",
-            "means = {key: total / len(decisions)",
+            "{name: total / lengths for",
+            "{name: total / len(decisions) for",
             "evaluation/test_rollout.py",
         ),
         (

@@ -70,7 +70,7 @@ def test_a_training_of_a_minute_needs_no_estimate_and_ends_at_its_total(clock):
     with TrainingBar(100, file=log) as bar:
         for clock[0] in (1, 30, 61):
             bar.advance(40)
-    assert log.getvalue().splitlines() == ["100 of 100 steps, 2 steps/s, 0 min left"]
+    assert log.getvalue().splitlines() == ["100 of 100 steps, 2 steps/s, 0 s left"]
 
 
 def test_a_minute_without_a_step_is_a_line_that_says_so(clock):

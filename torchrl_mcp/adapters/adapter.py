@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
+from torchrl_mcp.adapters.contract import entry_names
 from torchrl_mcp.adapters.reading import Number, Scaling, Vector
 from torchrl_mcp.values import Count, Finite, Names, Positive, Range, Rule, is_list
 
@@ -147,8 +148,7 @@ class Adapter(EnvBase):
     @property
     def metric_names(self) -> dict[str, list[str]]:
         """See :class:`~torchrl_mcp.adapters.contract.Environments`."""
-        sizes = {key: vector.size for key, vector in self._metrics.items()}
-        return {key: [key] if size == 1 else [f"{key}_{i}" for i in range(size)] for key, size in sizes.items()}
+        return entry_names({key: vector.size for key, vector in self._metrics.items()})
 
     def normalised_return(self, episode_return: Tensor) -> Tensor:
         r"""Return on the scale of ``worst`` and ``solved``, :math:`\bar{R} = (R - R_0) / (R_1 - R_0)`."""

@@ -32,6 +32,15 @@ class Reach(NamedTuple):
         return (returns.mean() - standing) / (self.ideal.mean() - standing)
 
 
+def entry_names(sizes: Mapping[str, int]) -> dict[str, list[str]]:
+    """Return names for the entries of each vector of a given size: its key, which is numbered if there are several.
+
+    >>> entry_names({"success": 1, "force": 2})
+    {'success': ['success'], 'force': ['force_0', 'force_1']}
+    """
+    return {key: [key] if size == 1 else [f"{key}_{i}" for i in range(size)] for key, size in sizes.items()}
+
+
 class Environments(Protocol):
     """N environments side by side, a TorchRL ``EnvBase`` with batch size ``[N]``.
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from torchrl_mcp.analysis.figures import COLOURS, INK, bare, new_figure
+from torchrl_mcp.analysis.figures import COLOURS, GRID, INK, bare, new_figure
 from torchrl_mcp.training.run_folder import NORMALISED_RETURN, read_metrics
 
 Array = NDArray[np.float64]
@@ -128,7 +128,7 @@ def plot_curves(
     bottom, top = axes.get_ylim()
     axes.set_ylim(min(0.0, bottom) if lowest < 0 else 0.0, max(0.0, top))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.grid(axis="y", color="#EEEEEE")
+    axes.grid(axis="y", color=GRID)
     axes.set_axisbelow(True)
     bare(axes)
 

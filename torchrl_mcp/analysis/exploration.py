@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, GRID, INK, bare, new_figure
 from torchrl_mcp.envs import CharacterEnv
 from torchrl_mcp.evaluation.rollout import evaluate
 from torchrl_mcp.methods.actor import Explorer
@@ -132,7 +132,7 @@ def draw_exploration(panels: Mapping[str, Exploration], *, title: str) -> Figure
         axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
         axes.set_title(f"{name}\n{_outcome(panel)}", fontsize=9, color=INK)
         axes.set_xlabel("forward (m)", fontsize=9)
-        axes.grid(color="#EEEEEE")
+        axes.grid(color=GRID)
         axes.set_axisbelow(True)
         bare(axes)
         if (reach := float(np.nanmax(np.abs(panel.positions)))) < 0.25 * half:

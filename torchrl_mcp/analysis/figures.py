@@ -22,6 +22,7 @@ DIRECTIONS = LinearSegmentedColormap.from_list(
 
 INK = "#333333"
 FAINT = "#DDDDDD"
+GRID = "#EEEEEE"
 
 
 def colours(num: int) -> list[str]:

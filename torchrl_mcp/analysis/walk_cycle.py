@@ -7,12 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 
-from torchrl_mcp.analysis.figures import INK, bare, colours, new_figure
+from torchrl_mcp.analysis.figures import GRID, INK, bare, colours, new_figure
 from torchrl_mcp.analysis.specialisation import PHASE_BINS, stance_correlation
 from torchrl_mcp.analysis.walks import STATES, Walk, cycle_rows, plane, specialisation
-
-SHADE = "#EEEEEE"
-"""Colour of phases in which only the right foot stands."""
 
 
 def draw_walk_cycle(walk: Walk, untrained: Mapping[str, float], *, title: str) -> Figure:
@@ -60,7 +57,7 @@ def _draw_weights(figure: SubFigure, walk: Walk) -> None:
         phase, mean, low, high = (
             np.array([row[key] for row in of_primitive]) for key in ("phase", "mean", "low", "high")
         )
-        axes.broken_barh(_spans(alone), (-0.04, 1.08), color=SHADE, linewidth=0)
+        axes.broken_barh(_spans(alone), (-0.04, 1.08), color=GRID, linewidth=0)
         axes.fill_between(phase, low, high, color=colour, alpha=0.25, linewidth=0)
         axes.plot(phase, mean, color=colour, linewidth=1.8)
         axes.set(ylim=(-0.04, 1.04), yticks=[0, 1], xlim=(0, 1))
@@ -120,6 +117,6 @@ def _draw_actions(figure: SubFigure, walk: Walk) -> None:
     axes.set_ylabel(f"principal component 2 ({shares[1]:.0%} of variance)", fontsize=9)
     axes.margins(0.08)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color="#EEEEEE")
+    axes.grid(color=GRID)
     axes.set_axisbelow(True)
     bare(axes)

@@ -21,6 +21,7 @@ from torchrl_mcp.commands.parsing import (
     settings,
     task_settings,
 )
+from torchrl_mcp.evaluation.wording import skill_text
 from torchrl_mcp.runs.builtin import locate
 from torchrl_mcp.training.run_folder import MODES, write_json
 
@@ -61,10 +62,7 @@ def report(arguments: argparse.Namespace, results: dict[str, Any], clips: list[d
             + "".join(f", {name} {value:.3f}" for name, value in numbers["metrics"].items())
         )
         if reach := numbers.get("reach"):
-            print(
-                f"    {round(100 * reach['skill'])}% of the way from standing still ({reach['standing']:.3f}) "
-                f"to an ideal player ({reach['ideal']:.3f})"
-            )
+            print(f"    {skill_text(reach)}")
         if "success_return" in numbers:
             print(f"    normalised return {numbers['success_return']:.3f} with the reward 1 while successful")
         if diagnostics := numbers["diagnostics"]:

@@ -33,8 +33,9 @@ class AdditiveGaussian(GatedPrimitives, MixtureSameFamily):
         scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive. (The paper's :math:`\sigma`
             is the variance.)
         gates: Weights, shape ``(*B, K)``, non-negative and not all zero. They are normalised to sum to one.
-        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
+        validate_args: Whether to check values. ``None`` follows torch's default, which is off once
+            ``torchrl.modules``, and therefore ``torchrl_mcp.modules``, is imported. Shapes are always checked. Unless
+            it is ``False``, the signs of scales and gates are also checked, on a CPU and outside ``torch.compile``.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not

@@ -2,6 +2,7 @@
 
 from typing import Self
 
+import torch
 from torch import Size, Tensor
 from torch.distributions import Distribution, Independent, Normal
 
@@ -43,8 +44,9 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
         scale: Primitive standard deviations, a number or shape ``(*B, K, A)``, positive. (The paper's :math:`\sigma`
             is the variance.)
         gates: Weights, shape ``(*B, K)``, non-negative. They need not sum to one.
-        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
+        validate_args: Whether to check values. ``None`` follows torch's default, which is off once
+            ``torchrl.modules``, and therefore ``torchrl_mcp.modules``, is imported. Shapes are always checked. Unless
+            it is ``False``, the signs of scales and gates are also checked, on a CPU and outside ``torch.compile``.
 
     Raises:
         ValueError: If the shapes do not match. With validation also if ``loc`` is not finite, ``scale`` is not
@@ -75,7 +77,9 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
         self.loc, self.scale, self.gates = loc, scale, gates
         # Not gates / scale**2, whose gradient overflows already at scales of 1e-10.
         precisions = gates.unsqueeze(-1) * scale.clamp_min(MIN_SCALE).reciprocal().square()
-        precision = precisions.sum(-2).clamp_min(MAX_SCALE**-2)
+        total = precisions.sum(-2)
+        # Where signs are not checked, such as on a GPU, raw logits make NaN and not a plausible distribution.
+        precision = torch.where(total < 0, torch.nan, total.clamp_min(MAX_SCALE**-2))
         mean = (precisions * loc).sum(-2) / precision
         super().__init__(Normal(mean, precision.rsqrt(), validate_args), 1, validate_args)
 

@@ -59,7 +59,7 @@ def broadcast_primitives(
     """Check primitives and gates, and bring them to one floating-point type and one batch shape.
 
     Shapes are always checked. Values are checked with ``validate_args``, which on a GPU waits for the device. By
-    default, gates on a CPU must not be negative, as raw logits are.
+    default, scales and gates on a CPU must not be negative, as raw outputs of a network are.
 
     Args:
         loc: Primitive means, shape ``(*B, K, A)``.
@@ -85,7 +85,7 @@ def broadcast_primitives(
     if Distribution._validate_args if validate_args is None else validate_args:
         check_values(loc, scale, gates)
     elif validate_args is None and gates.device.type == "cpu" and not torch.compiler.is_compiling():
-        check_signs(gates)
+        check_signs(scale, gates)
     dtype = reduce(torch.promote_types, (loc.dtype, scale.dtype, gates.dtype), torch.float32)
     return loc.to(dtype).expand(shape), scale.to(dtype).expand(shape), gates.to(dtype).expand(shape[:-1])
 
@@ -136,18 +136,22 @@ def check_values(loc: Tensor, scale: Tensor, gates: Tensor) -> None:
             raise ValueError(f"{name} of shape {tuple(value.shape)} contains {first}, but must be {rule}.")
 
 
-def check_signs(gates: Tensor) -> None:
-    """Check that gates are not negative: raw logits in their place would make a composite of NaN.
+def check_signs(scale: Tensor, gates: Tensor) -> None:
+    """Check that no scale and no gate is negative, as raw outputs of a network are.
 
     Raises:
-        ValueError: If a gate is negative, with the remedy.
+        ValueError: If one is negative, with the remedy.
     """
-    negative = gates < 0
-    if not torch._is_all_true(~negative):
-        raise ValueError(
-            f"gates of shape {tuple(gates.shape)} contains {gates[negative][0].item()}, but must be non-negative. If "
-            "they are logits, end the gate in a sigmoid or a softmax."
-        )
+    for name, value, remedy in (
+        ("scale", scale, "If they are raw outputs of a network, pass them through an exp or a softplus."),
+        ("gates", gates, "If they are logits, end the gate in a sigmoid or a softmax."),
+    ):
+        negative = value < 0
+        if not torch._is_all_true(~negative):
+            first = value[negative][0].item()
+            raise ValueError(
+                f"{name} of shape {tuple(value.shape)} contains {first}, but must be non-negative. {remedy}"
+            )
 
 
 def shapes(loc: Tensor, scale: Tensor, gates: Tensor) -> str:

@@ -35,8 +35,9 @@ class TanhMultiplicativeGaussian(GatedPrimitives, TransformedDistribution):
         gates: Weights, shape ``(*B, K)``, non-negative. They need not sum to one.
         low: Lower bound :math:`l`, a number or shape ``(A,)``, in action units.
         high: Upper bound :math:`h`, a number or shape ``(A,)``, in action units.
-        validate_args: Whether to check values. ``None`` follows torch's default, which TorchRL switches off when it is
-            imported. Shapes are always checked, and unless it is ``False`` also the signs of gates on a CPU.
+        validate_args: Whether to check values. ``None`` follows torch's default, which is off once
+            ``torchrl.modules``, and therefore ``torchrl_mcp.modules``, is imported. Shapes are always checked. Unless
+            it is ``False``, the signs of scales and gates are also checked, on a CPU and outside ``torch.compile``.
 
     Raises:
         ValueError: If the shapes do not match, or if the numbers ``low`` and ``high`` are in the wrong order or

@@ -1,7 +1,7 @@
 """Evaluates a policy by one episode in each of many environments."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,14 +86,12 @@ def evaluate(
     terminated = torch.zeros_like(running)
     path: list[Tensor] = []
     decisions: list[TensorDictBase] = []
-    flags: dict[str, Tensor] = {}
-    sums: dict[str, Tensor] = {}
     names = getattr(env, "metric_names", {})
-    for key in names:
-        kind = flags if env.observation_spec[key].dtype is torch.bool else sums
-        kind[key] = torch.zeros_like(state[key])
-    raised_steps = {key: torch.zeros_like(flag, dtype=torch.int64) for key, flag in flags.items()}
-    shortfalls = {key: torch.zeros_like(flag, dtype=returns.dtype) for key, flag in flags.items()}
+    zeros = {name: torch.zeros_like(value) for name, value in _by_name(state, names).items()}
+    flags = {name: zero for name, zero in zeros.items() if zero.dtype is torch.bool}
+    sums = {name: zero for name, zero in zeros.items() if zero.dtype is not torch.bool}
+    durations = {name: torch.zeros_like(lengths) for name in flags}
+    shortfall = torch.zeros_like(returns)
     steps = getattr(env, "max_episode_steps", None)
     with set_exploration_type(exploration), bar(steps, f"{len(running)} episodes") as shown:
         while running.any() and lengths.max() < max_steps:
@@ -102,43 +100,41 @@ def evaluate(
             decisions.append(decision.select(*record)[running.to(device)])
             step, state = env.step_and_maybe_reset(state.update(decision.to(env.device)))
             outcome = step["next"]
-            reward = task_reward(outcome)
-            returns += reward.squeeze(-1) * running
+            reward = task_reward(outcome).squeeze(-1)
+            returns += reward * running
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
-            for key, raised in flags.items():
-                flag = running.unsqueeze(-1) & outcome[key]
-                raised |= flag
-                raised_steps[key] += flag
-                shortfalls[key] += (1 - reward) * (flag & ~outcome["terminated"])  # a fall earns nothing
-            for key, total in sums.items():
-                total += outcome[key] * running.unsqueeze(-1)
+            measured = _by_name(outcome, names)
+            for name, flag in flags.items():
+                raised = running & measured[name]
+                flag |= raised
+                durations[name] += raised
+            for name, total in sums.items():
+                total += measured[name] * running
+            if SUCCESS in flags:  # a fall earns nothing
+                shortfall += (1 - reward) * (running & measured[SUCCESS] & ~terminated)
             running &= ~outcome["done"].squeeze(-1)
             if positions is not None:
                 path.append(torch.where(running.unsqueeze(-1), positions(), torch.nan))
-    means = {key: total / lengths.unsqueeze(-1) for key, total in sums.items()}
-    metrics = _by_name(flags | means, names)
-    durations = _by_name(raised_steps, names)
-    success_returns = returns + _by_name(shortfalls, names)[SUCCESS] if SUCCESS in durations else None
     return Evaluation(
         returns=returns,
         lengths=lengths,
         terminated=terminated,
-        metrics=metrics,
+        metrics=flags | {name: total / lengths for name, total in sums.items()},
         durations=durations,
-        success_returns=success_returns,
+        success_returns=returns + shortfall if SUCCESS in flags else None,
         decisions=torch.cat(decisions),
         reach=reach,
         positions=torch.stack(path) if path else None,
     )
 
 
-def _by_name(values: dict[str, Tensor], names: dict[str, list[str]]) -> dict[str, Tensor]:
-    """Return the columns of values ``(N, E)`` by the names of their entries, ``(N,)`` each."""
+def _by_name(values: TensorDictBase, names: Mapping[str, Sequence[str]]) -> dict[str, Tensor]:
+    """Return the columns of the metrics ``(N, E)`` among values by the names of their entries, ``(N,)`` each."""
     return {
         name: column
-        for key, columns in values.items()
-        for name, column in zip(names[key], columns.unbind(-1), strict=True)
+        for key, entries in names.items()
+        for name, column in zip(entries, values[key].unbind(-1), strict=True)
     }
 
 

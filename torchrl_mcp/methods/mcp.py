@@ -3,6 +3,7 @@
 The mixture of experts (Section E.6) has the same parts and actor, with another mixer, gate and primitives.
 """
 
+import math
 from collections.abc import Callable, Collection
 
 import torch
@@ -92,7 +93,7 @@ def _unit_stddev(mixer: Composition, gates: Tensor) -> float:
     """Return the standard deviation of unit Gaussians under gates ``(K,)``, after checking the mixer.
 
     Raises:
-        ValueError: If the mixer lacks a property that training needs.
+        ValueError: If the mixer lacks a property that training needs, or is not proportional to its primitives.
     """
     unit = torch.ones(len(gates), 1)
     composite = mixer(torch.zeros_like(unit), unit, gates)
@@ -102,7 +103,15 @@ def _unit_stddev(mixer: Composition, gates: Tensor) -> float:
             getattr(composite, name)
         except (AttributeError, NotImplementedError) as error:
             raise ValueError(f"the mixer {type(composite).__name__} lacks {name}, {use}: add the property") from error
-    return composite.stddev.item()
+    stddev = composite.stddev.item()
+    halved = mixer(torch.zeros_like(unit), unit / 2, gates).stddev.item()
+    if not math.isclose(halved, stddev / 2, rel_tol=1e-3):
+        raise ValueError(
+            f"the mixer {type(composite).__name__} has the standard deviation {stddev:.3g} over unit Gaussians, and "
+            f"{halved:.3g} over half as wide ones: it must be proportional to that of the primitives, which excludes "
+            "squashed actions"
+        )
+    return stddev
 
 
 def _valid(weights: Tensor) -> Tensor:
@@ -110,7 +119,7 @@ def _valid(weights: Tensor) -> Tensor:
     if not (weights.isfinite().all() and (weights >= 0).all() and (weights.sum(-1) > 0).all()):
         raise ValueError(
             "gating.activation makes weights that are negative, not finite or all zero, which cannot compose "
-            "primitives: end it in a sigmoid, a softmax or a softplus"
+            "primitives: end it in a sigmoid or a softmax"
         )
     return weights
 

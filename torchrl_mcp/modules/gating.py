@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_mcp.values import Count, NotNegative, Positive, Widths, checked
+from torchrl_mcp.values import Count, NotNegative, Positive, Whole, Widths, checked
 
 
 class Gating(nn.Module):
@@ -39,10 +39,11 @@ class Gating(nn.Module):
         torch.Size([16, 8])
     """
 
+    @checked
     def __init__(
         self,
-        observation_dim: int,
-        goal_dim: int,
+        observation_dim: Whole,
+        goal_dim: Whole,
         num_primitives: Count,
         *,
         state_cells: Widths = (512, 256),
@@ -89,10 +90,11 @@ class JointGating(nn.Module):
         True
     """
 
+    @checked
     def __init__(
         self,
-        observation_dim: int,
-        goal_dim: int,
+        observation_dim: Whole,
+        goal_dim: Whole,
         num_primitives: Count,
         *,
         num_cells: Widths = (1024, 512),

@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_mcp.values import NotNegative, Positive, Whole, checked
+
 LARGEST = 1e5
 """Bound on the features of a sample, in SI units; only diverged simulations exceed it."""
 
@@ -26,7 +28,7 @@ class RunningNormaliser(nn.Module):
         epsilon: Added to the variance.
 
     Raises:
-        ValueError: If ``size`` is negative or ``clip`` is not positive.
+        ValueError: If ``size`` or ``epsilon`` is negative, or ``clip`` is not positive.
 
     Example:
         >>> import torch
@@ -41,12 +43,9 @@ class RunningNormaliser(nn.Module):
     variance: Tensor
     count: Tensor
 
-    def __init__(self, size: int, *, clip: float = 10.0, epsilon: float = 1e-8) -> None:
+    @checked
+    def __init__(self, size: Whole, *, clip: Positive = 10.0, epsilon: NotNegative = 1e-8) -> None:
         super().__init__()
-        if size < 0:
-            raise ValueError(f"size must be a number of features, 0 or more, got {size}")
-        if clip <= 0:
-            raise ValueError(f"clip must be positive, got {clip}")
         self.clip = clip
         self.epsilon = epsilon
         self.register_buffer("mean", torch.zeros(size))

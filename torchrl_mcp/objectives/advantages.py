@@ -16,7 +16,7 @@ class Advantages:
 
     The critic evaluates every state once, because the value of a next state is the value of the following sample. After
     a time limit and at the end of the batch, no sample of the same episode follows: there the critic evaluates the
-    stored next observation. After its end, a terminated episode has the value 0.
+    stored next observation. The value after a terminated episode is 0.
 
     Rewards are multiplied by :math:`1 - \gamma` first. Returns therefore have the size of a reward, and the outputs of
     the critic are of order one for any discount factor.

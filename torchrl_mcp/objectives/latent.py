@@ -24,7 +24,7 @@ class LatentPPOLoss(BoundedClipPPOLoss):
     the penalty in both stages; at transfer it concerns :math:`q(w|s, g)`.
 
     Args:
-        actor_network: The policy, of :func:`torchrl_mcp.methods.latent_space.latent_actor`.
+        actor_network: The module ``trained`` of an actor of :mod:`torchrl_mcp.methods.latent_space`.
         critic_network: The value function, or None if it has its own loss.
         kl_coeff: Weight of the penalty, :math:`\beta`.
         **kwargs: Passed on to :class:`~torchrl_mcp.objectives.BoundedClipPPOLoss`.

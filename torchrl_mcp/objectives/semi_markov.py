@@ -17,7 +17,7 @@ class SemiMarkovAdvantages:
     .. math::
         A = \sum_{i=0}^{k-1} \gamma^i r_i + \gamma^k V(s') - V(s) + \gamma^k \lambda A'
 
-    where :math:`A'` is the advantage of the next choice. After its end, a terminated episode has the value 0. After a
+    where :math:`A'` is the advantage of the next choice. The value after a terminated episode is 0. After a
     time limit and at the end of the batch there is no next choice: there the value of the last state is used, even if
     the choice would have lasted longer. A batch should therefore be much longer than a choice.
 

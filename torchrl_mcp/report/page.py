@@ -9,6 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from torchrl_mcp import __version__
+from torchrl_mcp.evaluation.wording import duration
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.comparison import cells, methods
 from torchrl_mcp.report.paper import TABLE_2
@@ -122,17 +123,12 @@ def _machine(run: Run) -> str:
     return ", ".join([*parts, *networks, *versions]) or "unknown"
 
 
-def _duration(seconds: float) -> str:
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min" if minutes else f"{seconds:.0f} s"
-
-
 FILTERS = {
     "figure": "{:.3f}".format,
     "percent": "{:.0%}".format,
     "signed": lambda value: f"{value:+.3f}".replace("-", "−"),
     "steps": "{:,}".format,
-    "duration": _duration,
+    "duration": duration,
     "capital": lambda text: text[:1].upper() + text[1:],
     "words": lambda name: name.replace("_", " ").capitalize(),
     "place": place_title,

@@ -1,6 +1,5 @@
 """Reads run folders: configuration, progress, evaluation and provenance."""
 
-import csv
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,6 +17,7 @@ from torchrl_mcp.training.run_folder import (
     MODES,
     NORMALISED_RETURN,
     PROVENANCE,
+    UNREADABLE,
     is_run,
     read_json,
     read_metrics,
@@ -230,7 +230,7 @@ def read_run(folder: Path) -> Run | Damaged:
     for file, read in ((METRICS, _progress), (EVALUATION, _evaluation), (PROVENANCE, _provenance)):
         try:
             contents |= read(folder)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, csv.Error) as error:
+        except UNREADABLE as error:
             faults.append(f"{file} cannot be read: {_line(error)}")
     return Run(folder, **contents, fault="; ".join(faults) or None)
 

@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any
 
 from torchrl_mcp.analysis.curves import labelled_curves, plot_curves
-from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, colours, new_figure
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, GRID, INK, colours, new_figure
 from torchrl_mcp.report.cell import Cell
 from torchrl_mcp.report.comparison import ablations, caveats, methods
 from torchrl_mcp.report.paper import CHARACTERS
@@ -17,7 +17,7 @@ from torchrl_mcp.report.usage import diagnostics, usage, verdict
 LINES = {colour: f"var(--line-{number})" for number, colour in enumerate(COLOURS, start=1)}
 """CSS colours of lines by the colours of figures."""
 
-PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", "#EEEEEE": "var(--faint-rule)"}
+PAGE_COLOURS = LINES | {INK: "currentColor", FAINT: "var(--rule)", GRID: "var(--faint-rule)"}
 """CSS colours by all colours of figures."""
 
 DASHES = {"-": "none", "--": "7 3", ":": "2 3", "-.": "7 3 2 3"}

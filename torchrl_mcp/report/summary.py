@@ -1,15 +1,15 @@
 """The summary that a run prints at its end: results, folder, and next commands."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
+from torchrl_mcp.evaluation.wording import skill_text
 from torchrl_mcp.report.comparison import reported
 from torchrl_mcp.report.results import Run, read_run
 from torchrl_mcp.runs import quoting
 from torchrl_mcp.runs.trust import trust_options
-from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, MODES, NORMALISED_RETURN, read_metrics
+from torchrl_mcp.training.run_folder import CONFIG, EVALUATION, MODES, NORMALISED_RETURN, read_json, read_metrics
 
 
 def summary(folder: Path) -> str:
@@ -50,10 +50,7 @@ def _returns(folder: Path) -> list[str]:
     ]
     episodes = f"normalised return of {evaluation['episodes']} episodes, with 95 % intervals:"
     if "skill" in (reach := modes["deterministic"].get("reach", {})):
-        standing, ideal = (f"{reach[end]:.3f}" for end in ("standing", "ideal"))
-        values.insert(
-            1, f"{round(100 * reach['skill'])}% of the way from standing still ({standing}) to the ideal ({ideal})"
-        )
+        values.insert(1, skill_text(reach))
     return [episodes, *(f"  {value}" for value in [*values, *_paper(folder)])]
 
 
@@ -67,4 +64,4 @@ def _paper(folder: Path) -> list[str]:
 
 def _evaluation(folder: Path) -> dict[str, Any]:
     path = folder / EVALUATION
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return read_json(path) if path.is_file() else {}

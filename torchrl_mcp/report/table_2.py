@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from torchrl_mcp.analysis.figures import COLOURS, FAINT, INK, bare, new_figure
+from torchrl_mcp.analysis.figures import COLOURS, FAINT, GRID, INK, bare, new_figure
 from torchrl_mcp.evaluation.statistics import Estimate, interquartile_mean, probability_of_improvement
 from torchrl_mcp.report.cell import Cell, grouped
 from torchrl_mcp.report.comparison import methods
@@ -106,7 +106,7 @@ def draw_row(axes: Axes, place: Place, by_method: Mapping[str, Cell], titles: Ma
     axes.set_yticks(range(len(titles)), titles.values())
     axes.set_ylim(len(titles) - 0.5, -0.5)
     axes.set_xticks([0.0, 0.5, 1.0])
-    axes.grid(axis="x", color="#EEEEEE")
+    axes.grid(axis="x", color=GRID)
     axes.set_axisbelow(True)
     bare(axes)
 
@@ -160,7 +160,7 @@ def draw_estimates(axes: Axes, estimates: Mapping[str, Estimate], titles: Mappin
     axes.set_yticks(range(len(estimates)), [titles[name] for name in estimates])
     axes.set_ylim(len(estimates) - 0.5, -0.5)
     axes.set_xlim(1.02 * min(0.0, axes.dataLim.x0), 1.02 * max(1.0, axes.dataLim.x1))
-    axes.grid(axis="x", color="#EEEEEE")
+    axes.grid(axis="x", color=GRID)
     axes.set_xlabel(label, fontsize=9)
     bare(axes)
 

@@ -87,7 +87,7 @@ def _is_keywords(parameter: inspect.Parameter) -> bool:
 
 
 def require_callable(config: Mapping[str, Any]) -> None:
-    """Check that the library's classes and functions take the arguments that a configuration gives them.
+    """Check that the library's classes and functions, and own environments, take the arguments of a configuration.
 
     Args:
         config: The configuration, with resolved references.
@@ -98,7 +98,7 @@ def require_callable(config: Mapping[str, Any]) -> None:
     settings = list(leaves(config))
     for setting, name in settings:
         group = setting.removesuffix("_target_")
-        if group == setting or not str(name).startswith("torchrl_mcp.") or not exists(name):
+        if group == setting or not exists(name) or not (name.startswith("torchrl_mcp.") or _is_environment(name)):
             continue
         given = [inner.removeprefix(group).partition(".")[0] for inner, _ in settings if inner.startswith(group)]
         taken = arguments(name)
@@ -106,6 +106,11 @@ def require_callable(config: Mapping[str, Any]) -> None:
         if unknown and not is_open(taken):
             similar = difflib.get_close_matches(unknown[0], taken, cutoff=0.5) or sorted(taken)
             raise ValueError(f"{group}{unknown[0]} is not an argument of {name}: use one of {', '.join(similar)}")
+
+
+def _is_environment(name: str) -> bool:
+    target = pkgutil.resolve_name(name)
+    return inspect.isclass(target) and issubclass(target, CharacterEnv)
 
 
 def require_arguments(name: str, given: Mapping[str, Any]) -> None:

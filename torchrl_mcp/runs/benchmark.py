@@ -129,7 +129,7 @@ def plan(master: DictConfig, loader: ConfigLoader) -> list[Job]:
     for settings in expand(rows, choices):
         job = make_job({**settings, "stage": "transfer"}, master, loader)
         if job.config["transfer"]["keep"] and not job.config["pretrained"]:
-            needed = pretraining_of(settings, job.config["task"], master.benchmark.get("pretrain_seed"))
+            needed = pretraining_of(settings, job.config["task"])
             key = tuple(f"{name}={value}" for name, value in needed.items())
             pretraining[key] = pretraining.get(key) or make_job(needed, master, loader)
             job = job.after(pretraining[key].folder)
@@ -194,13 +194,12 @@ def values(override: Override) -> list[str]:
     return [override.get_value_element_as_str()]
 
 
-def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None = None) -> Settings:
+def pretraining_of(settings: Settings, task: Mapping[str, Any]) -> Settings:
     """Return the settings of the pre-training from which a run transfers.
 
     Args:
         settings: Settings of the run.
         task: Configuration of the run's task.
-        seed: Seed of the pre-training, or None for the seed of the run.
     """
     name = task["name"] if "pretrain" in task else "imitation"
     kept = {
@@ -209,7 +208,7 @@ def pretraining_of(settings: Settings, task: Mapping[str, Any], seed: int | None
         if not is_among(key.lstrip("+"), TRANSFER_ONLY)
         and (name == task["name"] or not key.lstrip("+").startswith("task."))
     }
-    return {**kept, "task": name, "stage": "pretrain"} | ({} if seed is None else {"seed": str(seed)})
+    return {**kept, "task": name, "stage": "pretrain"}
 
 
 def make_job(settings: Settings, master: DictConfig, loader: ConfigLoader) -> Job:
@@ -273,9 +272,7 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> list[Job]:
     while ready := [job for job in waiting if job.needs is None or is_complete(job.needs)]:
         try:
             launcher.launch([job.overrides for job in ready], initial_job_idx=len(launched))
-        except (
-            Exception
-        ):  # launchers raise all kinds of errors when a worker dies; the folders show which runs finished
+        except Exception:  # launchers raise all kinds of errors when a worker dies; the folders show what finished
             traceback.print_exc()
         launched += ready
         waiting = [job for job in waiting if job not in ready]

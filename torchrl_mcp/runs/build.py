@@ -1,6 +1,7 @@
 """Builds environments, agent and trainer from a configuration with Hydra's ``instantiate``."""
 
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -104,6 +105,7 @@ def make_agent(cfg: DictConfig, env: Environments, pretrained: Path | None = Non
         if pretrained is not None and cfg.transfer.keep:
             with _explained(cfg, pretrained):
                 _load_kept(cfg, parts, sizes, env, pretrained)
+            _warn_of_mixers(cfg, pretrained)
             if cfg.transfer.get("restart_noise"):
                 restart_noise(parts, cfg.action_std)
         names = cfg.transfer.freeze
@@ -137,6 +139,17 @@ def _explained(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
         raise ValueError(
             f"{pretrained} has networks of {saved_words}, which do not fit {words}: change one of the two"
         ) from error
+
+
+def _warn_of_mixers(cfg: DictConfig, pretrained: Path) -> None:
+    """Warn if kept primitives were pre-trained with another mixer, because their networks fit all the same."""
+    saved = checkpoint.saved_config(pretrained).get("mixer") or {}
+    if "primitives" in cfg.transfer.keep and "name" in saved and saved["name"] != cfg.mixer.name:
+        warnings.warn(
+            f"the primitives of {pretrained} were pre-trained with mixer={saved['name']}, and mixer={cfg.mixer.name} "
+            "now composes them: to compare mixers, pre-train with each, as benchmark=mixer does",
+            stacklevel=2,
+        )
 
 
 def _load_kept(cfg: DictConfig, parts: nn.ModuleDict, sizes: Sizes, env: Environments, pretrained: Path) -> None:

@@ -37,7 +37,11 @@ def train(cfg: DictConfig) -> Path:
 
 
 def resume(
-    folder: Path, *, device: str | None = None, total_frames: int | None = None, moves: Mapping[str, str] | None = None
+    folder: Path | str,
+    *,
+    device: str | None = None,
+    total_frames: int | None = None,
+    moves: Mapping[str, str] | None = None,
 ) -> Path:
     """Continue the run in ``folder`` from its newest checkpoint, with the configuration in the folder.
 
@@ -56,6 +60,7 @@ def resume(
             ``total_frames`` is not a number of steps or less than the run has taken, ``moves`` names a setting without
             a file, or this machine lacks the device, the logger or a file. The run is unchanged in all these cases.
     """
+    folder = Path(folder)
     if is_complete(folder) and total_frames is None and not moves:
         return folder
     files = places.outside(read_config(folder / CONFIG))

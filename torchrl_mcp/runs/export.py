@@ -46,7 +46,7 @@ class DeterministicPolicy(nn.Module):
             return self.policy(state)["action"]
 
 
-def example(path: Path, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor], dict[str, str]]:
+def example(path: Path | str, *, num: int = 8) -> tuple[DeterministicPolicy, tuple[Tensor, Tensor], dict[str, str]]:
     """Return the policy of a run, example observations ``(num, S)`` and goals ``(num, G)``, and the policy's interface.
 
     Args:
@@ -79,14 +79,14 @@ def export(policy: DeterministicPolicy, states: tuple[Tensor, Tensor]) -> Export
         return torch.export.export(policy, states, dynamic_shapes=({0: batch}, {0: batch}))
 
 
-def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path) -> None:
+def write_torch(policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path | str) -> None:
     """Write a policy for ``torch.export.load``, which needs only torch."""
-    with replacing(path) as partial, partial.open("wb") as file:  # torch would warn of the suffix of a path
+    with replacing(Path(path)) as partial, partial.open("wb") as file:  # torch would warn of the suffix of a path
         torch.export.save(export(policy, states), file)
 
 
 def write_onnx(
-    policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path, metadata: Mapping[str, str]
+    policy: DeterministicPolicy, states: tuple[Tensor, Tensor], path: Path | str, metadata: Mapping[str, str]
 ) -> float | None:
     """Write a policy as ONNX, and compare its actions with torch's if onnxruntime is installed.
 
@@ -112,6 +112,7 @@ def write_onnx(
         _name_batch(model.graph)
         onnx.helper.set_model_props(model, dict(metadata))
 
+    path = Path(path)
     require_onnx(path)
     write_program(export(policy, states), path, inputs=INPUTS, outputs=("action",), edit=edit)
     return onnx_difference(policy, states, path)

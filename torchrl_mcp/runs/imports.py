@@ -2,6 +2,7 @@
 
 import pkgutil
 import sys
+import warnings
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_mcp.envs.characters import CHARACTERS
 from torchrl_mcp.runs.arguments import exists
 from torchrl_mcp.runs.trust import require_trusted, targets
 
@@ -23,6 +25,12 @@ def require_environment(cfg: DictConfig) -> None:
     character = cfg.character.name
     if module := cfg.character.get("module"):
         import_own(module, f"character={character} is in the module")
+        if (body := CHARACTERS.get(character)) and (faults := body.check()):
+            warnings.warn(
+                f"character={character} breaks rules of characters, and may train wrongly: "
+                f"{'; '.join(map(str, faults))} ('torchrl-mcp-character check' lists all of them)",
+                stacklevel=2,
+            )
     if cfg.stage.name not in cfg.task:
         raise ValueError(
             f"task={task} has no stage={cfg.stage.name}: pre-train with task=imitation, and transfer to "

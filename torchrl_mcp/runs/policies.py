@@ -22,7 +22,7 @@ from torchrl_mcp.training import checkpoint
 from torchrl_mcp.training.run_folder import MODES
 
 
-def policy_config(path: Path) -> DictConfig:
+def policy_config(path: Path | str) -> DictConfig:
     """Return the configuration with which a policy was trained.
 
     Args:
@@ -53,7 +53,7 @@ def restore(
     Raises:
         ValueError: If there is no checkpoint, or the checkpoint is damaged or names classes that cannot be imported.
     """
-    file = checkpoint.find(Path(path))
+    file = checkpoint.find(path)
     cfg = policy_config(file)
     cfg.device = device
     env = make_env(cfg, num_envs=num_envs, seed=seed, **kwargs)
@@ -64,7 +64,7 @@ def restore(
     return cfg, agent, env
 
 
-def publish_run(path: Path, output: Path) -> None:
+def publish_run(path: Path | str, output: Path | str) -> None:
     """Write the policy of a run as a separate checkpoint file, as small as the built-in networks.
 
     The file omits the frozen parts if a built-in network has the same parts in bfloat16, bit for bit.
@@ -85,14 +85,14 @@ def publish_run(path: Path, output: Path) -> None:
         try:
             shared = fingerprints(parts, cfg.transfer.freeze, builtin(cfg.method.name, cfg.character.name))
         except ValueError:  # the frozen parts are not built in, so the file contains them
-            if cfg.pretrained == "builtin":
+            if str(cfg.pretrained).partition(":")[0] == places.BUILTIN:
                 raise
     config = cast("dict[str, Any]", OmegaConf.to_container(cfg))
     names = {value: Path(value).name for value in places.outside(config).values()}  # without folders of this machine
-    publish(parts, places.moved(config, names), output, shared=shared)
+    publish(parts, places.moved(config, names), Path(output), shared=shared)
 
 
-def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
+def evaluation(path: Path | str, *, episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
     """Evaluate a run's policy, and return the content of ``evaluation.json``.
 
     Args:
@@ -123,7 +123,7 @@ def evaluation(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> dict[s
     return results
 
 
-def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> list[ClipResult]:
+def evaluate_clips(path: Path | str, *, episodes: int, seed: int, **kwargs: Any) -> list[ClipResult]:
     """Return results of a run's deterministic policy on each of its reference motions.
 
     Args:
@@ -140,13 +140,13 @@ def evaluate_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> li
     return follow_each(agent.actor.policy, env)
 
 
-def _evaluation_environment(path: Path, further: Mapping[str, Any]) -> dict[str, Any]:
+def _evaluation_environment(path: Path | str, further: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of environments in evaluations of a run, and further arguments, which replace them."""
     settings: Any = OmegaConf.to_container(policy_config(path).evaluation, resolve=True)
     return {**settings["environment"], **further}
 
 
-def restore_for_clips(path: Path, *, episodes: int, seed: int, **kwargs: Any) -> tuple[Agent, Imitation]:
+def restore_for_clips(path: Path | str, *, episodes: int, seed: int, **kwargs: Any) -> tuple[Agent, Imitation]:
     """Return a run's agent and new environments, in which every episode follows a single clip and ends with it.
 
     Args:

@@ -60,6 +60,7 @@ def require_settings(cfg: DictConfig) -> None:
     """
     require_valid(cfg)
     require_used(cfg)
+    require_label(cfg)
 
 
 def require_executable(cfg: DictConfig) -> None:
@@ -138,6 +139,8 @@ def require_equipment(cfg: DictConfig) -> None:
         kind_of_device = torch.device(cfg.device).type
     except RuntimeError as error:
         raise ValueError(f"device={cfg.device} is not a device of torch: pass cpu or cuda") from error
+    if kind_of_device == "meta":
+        raise ValueError(f"device={cfg.device} holds no numbers: pass cpu or cuda")
     if kind_of_device == "mps":
         raise ValueError(f"device={cfg.device} lacks float64, in which normalisers count: pass cpu or cuda")
     if kind_of_device == "cuda" and not torch.cuda.is_available():
@@ -180,6 +183,20 @@ def require_used(cfg: DictConfig) -> None:
     remedies = {name: _remedy(name) for name in unused}
     if lines := [f"nothing uses the setting {name}: {remedy}" for name, remedy in remedies.items() if remedy]:
         raise ValueError("\n".join(lines))
+
+
+def require_label(cfg: DictConfig) -> None:
+    """Check that a run does not give its mixer the name of another mixer of the library, by which reports call it.
+
+    Raises:
+        ValueError: If it does, with the choice that changes the mixer.
+    """
+    path = CONF / "mixer" / f"{cfg.mixer.name}.yaml"
+    if path.is_file() and _content(path)["distribution_class"]["path"] != cfg.mixer.distribution_class.path:
+        raise ValueError(
+            f"mixer.name={cfg.mixer.name} is the name of another mixer than {cfg.mixer.distribution_class.path}: pass "
+            f"mixer={cfg.mixer.name} to use that mixer, or give this one another name"
+        )
 
 
 @cache

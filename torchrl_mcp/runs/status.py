@@ -23,6 +23,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from torchrl_mcp.evaluation.wording import duration
 from torchrl_mcp.runs import lock
 from torchrl_mcp.runs.tables import plain_table
 from torchrl_mcp.runs.trust import read_config
@@ -33,6 +34,7 @@ from torchrl_mcp.training.run_folder import (
     LOG,
     METRICS,
     NORMALISED_RETURN,
+    UNREADABLE,
     is_run,
     read_json,
     write_json,
@@ -43,9 +45,6 @@ MANIFEST = "benchmark-{}.json"
 
 STYLES = {"running": "cyan", "damaged": "red", "stopped": "red", "done": "green", "waiting": "dim"}
 """Colours of the states of a run, in the order of the table."""
-
-# Exceptions that reading a damaged file raises.
-UNREADABLE = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, csv.Error)
 
 INTERVAL = 1.0
 """Seconds between updates."""
@@ -205,7 +204,7 @@ def _cells(one: Status) -> tuple[str, ...]:
     steps = f"{min(one.frames, one.total):,}/{one.total:,}"  # the last batch may exceed the total
     speed = f"{one.speed:,.0f}" if one.state == "running" and one.speed else "-"
     score = "-" if one.normalised_return is None else f"{one.normalised_return:.3f}"
-    remaining = "-" if one.remaining is None else f"{one.remaining / 60:.0f} min"
+    remaining = "-" if one.remaining is None else duration(one.remaining)
     return one.state, steps, speed, score, remaining
 
 

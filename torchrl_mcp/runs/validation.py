@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -11,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mcp.runs.arguments import argument_types
 from torchrl_mcp.runs.schema import Evaluation, RunSettings, Task
-from torchrl_mcp.runs.settings import is_group, items
+from torchrl_mcp.runs.settings import is_group, items, leaves
 from torchrl_mcp.values import GROUP, Rule, is_group_type, rule_of, shown, type_of_entry, types_of
 
 
@@ -27,7 +28,10 @@ def require_valid(cfg: DictConfig) -> None:
     config = resolved(cfg)
     types = types_of_settings(config)
     wrong = [f"{name}=null must be {GROUP}" for name in types if is_group_type(types[name]) and name not in config]
-    wrong += wrong_values(config, types)
+    found = list(wrong_values(config, types))
+    references = [name for name, value in leaves(OmegaConf.to_container(cfg)) if "${" in str(value)]
+    referring = re.compile(rf"({'|'.join(map(re.escape, references))})[.= ]")
+    wrong += [line for line in found if not referring.match(line)] or found
     if not wrong and (schedule := config["optimizer"].get("schedule")):
         wrong += _step_size_out_of_range(config["step_size"]["actor"], schedule)
     if not wrong:

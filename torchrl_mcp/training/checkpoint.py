@@ -143,12 +143,13 @@ def save(checkpoint: Checkpoint, checkpoints: CheckpointRotation, *, step: int, 
     checkpoints.prune()
 
 
-def find(path: Path) -> Path:
+def find(path: Path | str) -> Path:
     """Return ``path`` if it is a file, or the newest checkpoint of the run folder ``path``.
 
     Raises:
         ValueError: If there is no checkpoint.
     """
+    path = Path(path)
     if path.is_file():
         return path
     if saved := find_all(path):

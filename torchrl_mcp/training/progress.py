@@ -11,6 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_mcp.evaluation.bars import bar
+from torchrl_mcp.evaluation.wording import duration
 
 QUIET = 60.0
 """Seconds between lines where the output is not a terminal."""
@@ -70,15 +71,6 @@ class Stopwatch:
         starts: list[float] = []
         module.register_forward_pre_hook(lambda *_: starts.append(time.perf_counter()))
         module.register_forward_hook(lambda *_: self.add(section, time.perf_counter() - starts.pop()))
-
-
-def duration(seconds: float) -> str:
-    """Return a duration in words.
-
-    >>> duration(90), duration(9000)
-    ('2 min', '2.5 h')
-    """
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 class TrainingBar:

@@ -39,6 +39,9 @@ WANDB = "wandb-id"
 CHECKPOINTS = "checkpoints"
 """The folder of checkpoints."""
 
+UNREADABLE = (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError, csv.Error)
+"""Exceptions that reading a damaged file raises."""
+
 CHECKPOINT = "checkpoint-{:012d}.torchrl"
 """Name of a checkpoint file, with the number of environment steps, as TorchRL's rotation expects it."""
 

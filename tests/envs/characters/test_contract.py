@@ -85,6 +85,11 @@ def test_the_librarys_characters_keep_the_contract(name):
     assert CHARACTERS[name].check() == []
 
 
+def test_a_model_without_bodies_breaks_it():
+    (violation,) = violations(mujoco.MjSpec(), feet=())
+    assert violation.finding == "has no body"
+
+
 def test_a_small_character_keeps_it():
     assert found() == []
 
