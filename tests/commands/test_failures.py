@@ -114,3 +114,12 @@ def test_a_result_that_cannot_be_written_ends_in_a_sentence(words, monkeypatch, 
     with pytest.raises(SystemExit) as stop:
         import_module(f"torchrl_mcp.commands.{words[0]}").main(words[1:])
     assert re.fullmatch(rf"torchrl-mcp-{words[0]}: .*(File exists|Not a directory): 'file.*'", str(stop.value.code))
+
+
+def test_a_reader_that_closes_the_output_ends_the_command_silently(tmp_path):
+    program = [sys.executable, "-m", "torchrl_mcp.commands.status", "."]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path) as command:
+        command.stdout.close()
+        errors = command.stderr.read().decode()
+    assert errors == ""
+    assert command.returncode == 141

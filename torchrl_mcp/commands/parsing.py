@@ -6,6 +6,7 @@ This module imports neither torch nor MuJoCo nor Hydra, which take seconds to im
 import argparse
 import math
 import os
+import select
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +22,9 @@ from torchrl_mcp.runs.quoting import quoted
 
 CHECKPOINT = "run folder (its newest checkpoint), checkpoint file, builtin:CHARACTER or builtin:CHARACTER-TASK"
 """Help of an argument that names a policy."""
+
+BROKEN_PIPE = 141
+"""Exit status of a program whose output nobody reads any more, as in a shell: 128 and the number of SIGPIPE."""
 
 RESERVED = ("seed", "num_envs", "device", "episodes", "path")
 """Arguments of tasks that the commands pass, so that ``--task`` must not."""
@@ -56,7 +60,7 @@ def entry_point(program: str, *errors: type[Exception]) -> Callable[[Callable[[l
     """Return a decorator that makes a function of the words of a command line the entry point of a command.
 
     The command ends with a sentence if it is interrupted or its input is bad. In Python's development mode (``-X dev``)
-    bad input ends it with a traceback.
+    bad input ends it with a traceback. A reader that closes the command's output, such as ``head``, ends it silently.
 
     Args:
         program: Name of the command.
@@ -67,10 +71,15 @@ def entry_point(program: str, *errors: type[Exception]) -> Callable[[Callable[[l
         @wraps(main)
         def run(words: Sequence[str] | None = None) -> None:
             try:
-                main(list(sys.argv[1:] if words is None else words))
+                try:
+                    main(list(sys.argv[1:] if words is None else words))
+                finally:
+                    sys.stdout.flush()
             except KeyboardInterrupt:
                 sys.exit(f"\n{program}: interrupted")
             except (OSError, ValueError, yaml.YAMLError, *errors) as error:
+                if isinstance(error, BrokenPipeError) and _is_output_closed():
+                    sys.exit(BROKEN_PIPE)
                 if sys.flags.dev_mode:
                     raise
                 if isinstance(error, yaml.YAMLError):
@@ -80,6 +89,17 @@ def entry_point(program: str, *errors: type[Exception]) -> Callable[[Callable[[l
         return run
 
     return decorate
+
+
+def _is_output_closed() -> bool:
+    """Return whether the reader of standard output is gone; if so, discard the output that is left."""
+    pipe = sys.stdout.fileno()
+    pipes = select.poll()
+    pipes.register(pipe, 0)
+    closed = any(event & select.POLLERR for _, event in pipes.poll(0))
+    if closed:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), pipe)  # Python flushes again when it ends
+    return closed
 
 
 def announce(program: str) -> None:
