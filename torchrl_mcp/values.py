@@ -87,7 +87,7 @@ NotNegative = Annotated[float, Rule("a finite number, at least 0", lambda value:
 Share = Annotated[float, Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value <= 1)]
 Discount = Annotated[float, Rule("a number from 0 to 1, below 1", lambda value: is_number(value) and 0 <= value < 1)]
 Probability = Annotated[float, Rule("a number between 0 and 1", lambda value: is_number(value) and 0 < value < 1)]
-# A time between events or a number of inputs; infinite for none
+# A time between events, a number of inputs or a bound; infinite for none
 Period = Annotated[
     float,
     Rule(

@@ -63,10 +63,10 @@ def location_reward(velocity: Tensor, offset: Tensor, speed: float, alignment: T
     .. math::
         r = 0.4 \exp(-\|x\|^2) \frac{1 + c}{2} + 0.6 \exp(-4 \|v_{com} - v^*\|^2)
 
-    The second term guides the character from any distance, where the first is flat. In the last metre it asks for a
-    velocity that falls with the distance, and at the place for standing still. Motion across counts, because a
-    character that circles never arrives. The direction to face is a factor of the first term, so that it matters only
-    at the place.
+    :func:`location_velocity` is the target velocity :math:`v^*`. The second term guides the character from any
+    distance, where the first is flat. In the last metre this term asks for a velocity that falls with the distance, and
+    at the place for standing still. Motion across counts, because a character that circles never arrives. The direction
+    to face is a factor of the first term, so that it matters only at the place.
 
     Args:
         velocity: Horizontal velocity of the centre of mass :math:`v_{com}`, shape ``(*B, 2)``, in m/s.

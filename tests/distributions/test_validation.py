@@ -107,7 +107,7 @@ def test_raw_outputs_are_refused_with_the_remedy_where_validation_is_off_by_defa
     refused(lambda: distribution_class(**GOOD | {"scale": scale}), "scale of shape (3, 2) contains -0.5", "softplus")
 
 
-def test_a_product_under_raw_logits_is_nan_where_signs_are_not_checked():
+def test_a_product_of_negative_precision_is_nan_where_signs_are_not_checked():
     loc, scale = torch.tensor([[0.0], [3.0]]), torch.ones(2, 1)
     composite = MultiplicativeGaussian(loc, scale, torch.tensor([-2.0, 1.0]), validate_args=False)
     assert composite.mean.isnan().all()

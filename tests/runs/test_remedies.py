@@ -108,8 +108,8 @@ def test_a_misspelt_argument_of_a_task_of_ones_own_is_refused_with_the_argument_
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     Path("approach_task.py").write_text(TASK)
-    own = [*HEADING, *SCRATCH, "task.transfer._target_=approach_task.Approach", "+task.transfer.radus=1.0"]
-    refused(lambda: experiment.train(configure(tmp_path, *own)), "task.transfer.radus", "radius")
+    task = [*HEADING, *SCRATCH, "task.transfer._target_=approach_task.Approach", "+task.transfer.radus=1.0"]
+    refused(lambda: experiment.train(configure(tmp_path, *task)), "task.transfer.radus", "radius")
 
 
 CHARACTER = """

@@ -464,8 +464,8 @@ FAULTS = {
             "evaluation/test_rollout.py",
         ),
         (
-            "measured[SUCCESS] & ~terminated",
-            "measured[SUCCESS]",
+            "metrics_of_step[SUCCESS] & ~terminated",
+            "metrics_of_step[SUCCESS]",
             "evaluation/test_rollout.py envs/tasks/test_transport_success.py",
         ),
         (

@@ -78,7 +78,7 @@ class MultiplicativeGaussian(GatedPrimitives, Independent):
         # Not gates / scale**2, whose gradient overflows already at scales of 1e-10.
         precisions = gates.unsqueeze(-1) * scale.clamp_min(MIN_SCALE).reciprocal().square()
         total = precisions.sum(-2)
-        # Where signs are not checked, such as on a GPU, raw logits make NaN and not a plausible distribution.
+        # Where signs are not checked, such as on a GPU, a negative precision must not become a plausible distribution.
         precision = torch.where(total < 0, torch.nan, total.clamp_min(MAX_SCALE**-2))
         mean = (precisions * loc).sum(-2) / precision
         super().__init__(Normal(mean, precision.rsqrt(), validate_args), 1, validate_args)

@@ -104,15 +104,15 @@ def evaluate(
             returns += reward * running
             lengths += running
             terminated |= running & outcome["terminated"].squeeze(-1)
-            measured = _by_name(outcome, names)
+            metrics_of_step = _by_name(outcome, names)
             for name, flag in flags.items():
-                raised = running & measured[name]
-                flag |= raised
-                durations[name] += raised
+                is_raised = running & metrics_of_step[name]
+                flag |= is_raised
+                durations[name] += is_raised
             for name, total in sums.items():
-                total += measured[name] * running
+                total += metrics_of_step[name] * running
             if SUCCESS in flags:  # a fall earns nothing
-                shortfall += (1 - reward) * (running & measured[SUCCESS] & ~terminated)
+                shortfall += (1 - reward) * (running & metrics_of_step[SUCCESS] & ~terminated)
             running &= ~outcome["done"].squeeze(-1)
             if positions is not None:
                 path.append(torch.where(running.unsqueeze(-1), positions(), torch.nan))

@@ -20,5 +20,6 @@ def skill_text(reach: Mapping[str, float]) -> str:
     >>> skill_text({"skill": 0.5, "standing": 0.2, "ideal": 0.8})
     '50% of the way from standing still (0.200) to an ideal player (0.800)'
     """
-    standing, ideal = reach["standing"], reach["ideal"]
-    return f"{reach['skill']:.0%} of the way from standing still ({standing:.3f}) to an ideal player ({ideal:.3f})"
+    standing = f"standing still ({reach['standing']:.3f})"
+    ideal = f"an ideal player ({reach['ideal']:.3f})"
+    return f"{reach['skill']:.0%} of the way from {standing} to {ideal}"

@@ -104,12 +104,12 @@ def _unit_stddev(mixer: Composition, gates: Tensor) -> float:
         except (AttributeError, NotImplementedError) as error:
             raise ValueError(f"the mixer {type(composite).__name__} lacks {name}, {use}: add the property") from error
     stddev = composite.stddev.item()
-    halved = mixer(torch.zeros_like(unit), unit / 2, gates).stddev.item()
-    if not math.isclose(halved, stddev / 2, rel_tol=1e-3):
+    half_stddev = mixer(torch.zeros_like(unit), unit / 2, gates).stddev.item()
+    if not math.isclose(half_stddev, stddev / 2, rel_tol=1e-3):
         raise ValueError(
             f"the mixer {type(composite).__name__} has the standard deviation {stddev:.3g} over unit Gaussians, and "
-            f"{halved:.3g} over half as wide ones: it must be proportional to that of the primitives, which excludes "
-            "squashed actions"
+            f"{half_stddev:.3g} over half as wide ones: it must be proportional to that of the primitives, which "
+            "excludes squashed actions"
         )
     return stddev
 

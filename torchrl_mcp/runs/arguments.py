@@ -87,7 +87,7 @@ def _is_keywords(parameter: inspect.Parameter) -> bool:
 
 
 def require_callable(config: Mapping[str, Any]) -> None:
-    """Check that the library's classes and functions, and own environments, take the arguments of a configuration.
+    """Check that classes and functions of the library, and environments derived from its own, take their arguments.
 
     Args:
         config: The configuration, with resolved references.
@@ -96,7 +96,8 @@ def require_callable(config: Mapping[str, Any]) -> None:
         ValueError: If an argument is unknown; the message names the most similar arguments.
     """
     settings = list(leaves(config))
-    for setting, name in settings:
+    for setting, value in settings:
+        name = str(value)
         group = setting.removesuffix("_target_")
         if group == setting or not exists(name) or not (name.startswith("torchrl_mcp.") or _is_environment(name)):
             continue

@@ -143,10 +143,10 @@ def _explained(cfg: DictConfig, pretrained: Path) -> Iterator[None]:
 
 def _warn_of_mixers(cfg: DictConfig, pretrained: Path) -> None:
     """Warn if kept primitives were pre-trained with another mixer, because their networks fit all the same."""
-    saved = checkpoint.saved_config(pretrained).get("mixer") or {}
-    if "primitives" in cfg.transfer.keep and "name" in saved and saved["name"] != cfg.mixer.name:
+    first_mixer = checkpoint.saved_config(pretrained).get("mixer", {}).get("name", cfg.mixer.name)
+    if "primitives" in cfg.transfer.keep and first_mixer != cfg.mixer.name:
         warnings.warn(
-            f"the primitives of {pretrained} were pre-trained with mixer={saved['name']}, and mixer={cfg.mixer.name} "
+            f"the primitives of {pretrained} were pre-trained with mixer={first_mixer}, and mixer={cfg.mixer.name} "
             "now composes them: to compare mixers, pre-train with each, as benchmark=mixer does",
             stacklevel=2,
         )

@@ -27,8 +27,8 @@ def require_environment(cfg: DictConfig) -> None:
         import_own(module, f"character={character} is in the module")
         if (body := CHARACTERS.get(character)) and (faults := body.check()):
             warnings.warn(
-                f"character={character} breaks rules of characters, and may train wrongly: "
-                f"{'; '.join(map(str, faults))} ('torchrl-mcp-character check' lists all of them)",
+                f"character={character} breaks rules of characters, so that the simulation may be wrong: "
+                f"{'; '.join(map(str, faults))}",
                 stacklevel=2,
             )
     if cfg.stage.name not in cfg.task:

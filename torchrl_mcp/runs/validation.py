@@ -28,10 +28,11 @@ def require_valid(cfg: DictConfig) -> None:
     config = resolved(cfg)
     types = types_of_settings(config)
     wrong = [f"{name}=null must be {GROUP}" for name in types if is_group_type(types[name]) and name not in config]
-    found = list(wrong_values(config, types))
+    errors = list(wrong_values(config, types))
+    # A setting that refers to a wrong setting has the same wrong value, which is named once.
     references = [name for name, value in leaves(OmegaConf.to_container(cfg)) if "${" in str(value)]
     referring = re.compile(rf"({'|'.join(map(re.escape, references))})[.= ]")
-    wrong += [line for line in found if not referring.match(line)] or found
+    wrong += [line for line in errors if not referring.match(line)] or errors
     if not wrong and (schedule := config["optimizer"].get("schedule")):
         wrong += _step_size_out_of_range(config["step_size"]["actor"], schedule)
     if not wrong:
