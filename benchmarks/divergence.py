@@ -10,8 +10,8 @@ each update:
 - ``exact``: the exact KL divergence of the new from the old policy, averaged over the samples;
 - ``without_extremes``: the same average without the thousandth of the samples with the largest divergences;
 - ``median``, ``largest``: median and largest divergence of a sample;
-- ``far_inputs``, ``far_inputs_of_extremes``: mean number of normalised features of the state above 5 or below -5, in all
-  samples and in that thousandth of the samples;
+- ``far_inputs``, ``far_inputs_of_extremes``: mean number of normalised features of the state above 5 or below -5, in
+  all samples and in that thousandth of the samples;
 - ``smallest_std``: the smallest standard deviation of the new policy.
 
 An update takes about ten seconds on one core. A run has only the checkpoints that ``keep_checkpoints`` keeps.

@@ -7,13 +7,17 @@ import runpy
 import sys
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torch.distributions import Independent, Normal
 
 from torchrl_mcp.distributions import MultiplicativeGaussian
 from torchrl_mcp.envs import Heading
 from torchrl_mcp.evaluation.rollout import Evaluation
+from torchrl_mcp.modules import RunningNormaliser
 from torchrl_mcp.runs import policies
 from torchrl_mcp.runs.builtin import builtin
 
@@ -216,6 +220,36 @@ def test_checkpoints_are_evaluated_after_numbers_of_steps_and_only_once(command,
     monkeypatch.setattr(budgets.policies, "evaluation", None)
     budgets.main()
     assert output.read_text() == first
+
+
+def test_updates_are_repeated_and_the_policy_is_compared_before_and_after(command, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    network = BENCHMARKS / "results" / "table2" / "networks" / "latent_space-biped-0.torchrl"
+    words = ["preset=smoke", "task=dribble", "method=latent_space", "stage=transfer", f"pretrained={network}"]
+    settings = ["checkpoint_interval=1", "keep_checkpoints=9", "task.evaluation.max_episode_steps=9"]
+    assert command("train", *words, *settings, f"run_dir={tmp_path}/run").returncode == 0
+    main = runpy.run_path(str(BENCHMARKS / "divergence.py"))["main"]
+    output = tmp_path / "divergence.csv"
+    arguments = ["divergence.py", str(tmp_path / "run"), "--updates", "1", "--output", str(output)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    main()
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        trained = {row["iteration"]: row["loss/kl"] for row in csv.DictReader(file)}
+    repeated = {row["iteration"]: row["estimate"] for row in csv.DictReader(output.open())}
+    assert repeated == {iteration: trained[iteration] for iteration in ("2", "3", "4")}
+
+
+def test_the_extremes_of_an_update_are_told_from_the_other_samples(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    comparison = runpy.run_path(str(BENCHMARKS / "divergence.py"))["Comparison"]
+    states, means = torch.zeros(1000, 1), torch.full((1000, 1), 0.1)
+    states[7], means[7] = -6.0, 10.0
+    agent = SimpleNamespace(parts={"observation_normaliser": RunningNormaliser(1)})
+    before, after = (Independent(Normal(loc, 1.0), 1) for loc in (torch.zeros(1000, 1), means))
+    row = comparison(SimpleNamespace(agent=agent))._changes(TensorDict(observation=states), before, after)
+    expected = {"exact": (999 * 0.005 + 50) / 1000, "without_extremes": 0.005, "median": 0.005, "largest": 50.0}
+    expected |= {"far_inputs": 0.001, "far_inputs_of_extremes": 1.0, "smallest_std": 1.0}
+    assert row == pytest.approx(expected)
 
 
 def test_every_episode_of_a_transport_task_has_one_outcome(monkeypatch):
