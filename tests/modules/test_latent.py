@@ -45,3 +45,19 @@ def test_codes_stay_float32_under_autocast(encoder):
     with torch.autocast("cpu", torch.bfloat16):
         loc, scale = encoder(3, 2, 4)(torch.randn(10, 3), torch.randn(10, 2))
     assert loc.dtype == scale.dtype == torch.float32
+
+
+@pytest.mark.parametrize("encoder", [GoalEncoder, StateGoalEncoder])
+def test_noise_has_a_lower_bound(encoder):
+    network = encoder(3, 2, 4, min_std=0.5)
+    torch.nn.init.zeros_(network.output.weight)
+    with torch.no_grad():
+        network.output.bias.copy_(torch.tensor([1.0, 2.0, 3.0, 4.0, *torch.tensor([0.0, 0.1, 0.7, 2.0]).log()]))
+    loc, scale = network(torch.randn(3), torch.randn(2))
+    torch.testing.assert_close(loc, torch.tensor([1.0, 2.0, 3.0, 4.0]))
+    torch.testing.assert_close(scale, torch.tensor([0.5, 0.5, 0.7, 2.0]))
+
+
+def test_a_negative_lower_bound_is_refused():
+    with pytest.raises(ValueError, match=r"min_std=-0.1 must be a finite number, at least 0"):
+        StateGoalEncoder(3, 2, 4, min_std=-0.1)

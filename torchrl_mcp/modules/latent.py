@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from torchrl_mcp.modules.gating import at_least_single, relu_mlp, scaled_cells
-from torchrl_mcp.values import Count, Positive, Widths
+from torchrl_mcp.values import Count, NotNegative, Positive, Whole, Widths, checked
 
 
 class StateGoalEncoder(nn.Module):
@@ -15,6 +15,9 @@ class StateGoalEncoder(nn.Module):
         latent_dim: Size of the latent variable, ``L``.
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
+        min_std: Lower bound of the standard deviation. Without a bound, the standard deviation can become tiny in
+            states that are far from most others, for example while the character falls, so that an update that hardly
+            changes the mean there has an enormous KL divergence.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
@@ -28,16 +31,19 @@ class StateGoalEncoder(nn.Module):
         (torch.Size([32, 16]), torch.Size([32, 16]))
     """
 
+    @checked
     def __init__(
         self,
-        observation_dim: int,
-        goal_dim: int,
+        observation_dim: Whole,
+        goal_dim: Whole,
         latent_dim: Count,
         *,
         num_cells: Widths = (1024, 512),
         width: Positive = 1.0,
+        min_std: NotNegative = 0.0,
     ) -> None:
         super().__init__()
+        self.min_std = min_std
         num_cells = scaled_cells(num_cells, width)
         self.body = relu_mlp(observation_dim + goal_dim, num_cells)
         self.output = nn.Linear(num_cells[-1], 2 * latent_dim)
@@ -48,7 +54,7 @@ class StateGoalEncoder(nn.Module):
 
     def _gaussian(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc, log_scale = at_least_single(self.output(self.body(*inputs))).chunk(2, dim=-1)
-        return loc, log_scale.exp()
+        return loc, log_scale.exp().clamp_min(self.min_std)
 
 
 class GoalEncoder(StateGoalEncoder):
@@ -75,16 +81,18 @@ class GoalEncoder(StateGoalEncoder):
         (torch.Size([32, 16]), torch.Size([32, 16]))
     """
 
+    @checked
     def __init__(
         self,
-        observation_dim: int,
-        goal_dim: int,
+        observation_dim: Whole,
+        goal_dim: Whole,
         latent_dim: Count,
         *,
         num_cells: Widths = (256, 128),
         width: Positive = 1.0,
+        min_std: NotNegative = 0.0,
     ) -> None:
-        super().__init__(0, goal_dim, latent_dim, num_cells=num_cells, width=width)
+        super().__init__(0, goal_dim, latent_dim, num_cells=num_cells, width=width, min_std=min_std)
 
     def forward(self, observation: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``(*B, L)``, from a goal ``(*B, G)`` alone."""
