@@ -2,6 +2,7 @@ from functools import partial
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from refusals import refused
 from tensordict import TensorDict
 from torch.distributions import Independent, Normal
@@ -10,6 +11,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.latent_space import LATENT, NOISE, latent_actor, latent_parts, latents_actor
 from torchrl_mcp.modules import GaussianPolicy, GoalEncoder, StateGoalEncoder
+from torchrl_mcp.runs.configuration import compose_run
 
 S, G, A, L = 6, 2, 3, 4
 
@@ -140,3 +142,17 @@ def test_the_noise_of_the_latent_variable_can_be_fixed():
         stored = actor.policy(states(20))
     score = Independent(Normal(stored["latent", "loc"], 0.7), 1).log_prob(stored["latents"])
     torch.testing.assert_close(stored["latents_log_prob"], score)
+
+
+@pytest.mark.parametrize(
+    ("words", "least"),
+    [
+        (["task=dribble", "stage=transfer"], 0.1),
+        (["task=dribble", "stage=transfer", "exploration.min_latent_std=0.2"], 0.2),
+        (["task=dribble", "stage=transfer", "preset=paper"], 0.0),
+        (["task=imitation"], 0.0),
+    ],
+)
+def test_the_noise_of_the_latent_variable_is_bounded_where_it_explores(words, least):
+    cfg = compose_run("method=latent_space", *words)
+    assert instantiate(cfg.parts.encoder)(3, 2, 4).min_std == least

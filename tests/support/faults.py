@@ -107,6 +107,7 @@ FAULTS = {
             "methods/test_composite.py modules/test_primitives.py",
         ),
     ],
+    "torchrl_mcp/modules/latent.py": [("clamp_min", "clamp_max", "modules/test_latent.py")],
     "torchrl_mcp/modules/normaliser.py": [
         ("(1 - share) * delta.square()", "delta.square()", "modules/test_normaliser.py"),
         (".clamp(-self.clip, self.clip)", "", "modules/test_normaliser.py"),

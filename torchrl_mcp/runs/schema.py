@@ -95,6 +95,7 @@ class Exploration(TypedDict):
     bound_coeff: NotNegative
     latent_std: Positive | None
     learned_logits_std: Positive | None
+    min_latent_std: NotNegative
 
 
 class CurriculumChoice(TypedDict):
