@@ -19,7 +19,6 @@ An update takes about ten seconds on one core. A run has only the checkpoints th
 
 import argparse
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,6 +27,7 @@ import torch
 from omegaconf import DictConfig
 from report import about, append, table
 from tensordict import TensorDictBase
+from torch import Tensor
 from torch.distributions import Independent, Normal, kl_divergence
 
 from torchrl_mcp.runs import build, records
@@ -60,10 +60,13 @@ class Comparison:
 
     def __call__(self, batch: TensorDictBase, *, warming_up: bool) -> dict[str, float]:
         """Learn from trajectories ``(N, T)``, and return the metrics of the update."""
-        samples = batch.select("observation", "goal", *self.update.agent.actor.stored).flatten()
+        agent = self.update.agent
+        samples = batch.select("observation", "goal", *agent.actor.stored).flatten()
+        states = agent.parts["observation_normaliser"](samples["observation"])
         before = self._policy(samples)
         metrics = self.update(batch, warming_up=warming_up)
-        self.rows.append({"estimate": metrics["loss/kl"]} | self._changes(samples, before, self._policy(samples)))
+        after = self._policy(samples)
+        self.rows.append({"estimate": metrics["loss/kl"], **changes(states, before, after)})
         return metrics
 
     def _policy(self, samples: TensorDictBase) -> Independent:
@@ -72,34 +75,44 @@ class Comparison:
             distribution = self.update.agent.actor.trained.get_dist(samples.clone())
             return Independent(Normal(distribution.mean.clone(), distribution.stddev.clone()), 1)
 
-    def _changes(self, samples: TensorDictBase, before: Independent, after: Independent) -> dict[str, float]:
-        divergences = kl_divergence(before, after)
-        order = divergences.argsort(descending=True)
-        extremes, others = order.tensor_split([round(EXTREMES * len(order))])
-        normalised = self.update.agent.parts["observation_normaliser"](samples["observation"])
-        far = (normalised.abs() > FAR).sum(-1).float()
-        return {
-            "exact": divergences.mean().item(),
-            "without_extremes": divergences[others].mean().item(),
-            "median": divergences.median().item(),
-            "largest": divergences.max().item(),
-            "far_inputs": far.mean().item(),
-            "far_inputs_of_extremes": far[extremes].mean().item(),
-            "smallest_std": after.stddev.min().item(),
-        }
+
+def changes(states: Tensor, before: Independent, after: Independent) -> dict[str, float]:
+    """Compare a policy before and after an update, in ``B`` samples.
+
+    Args:
+        states: Normalised features of the samples' states, ``(B, S)``.
+        before: The policy before the update, with batch shape ``(B,)``.
+        after: The policy after the update, of the same shape.
+
+    Returns:
+        The measurements that the head of this file lists, except ``estimate``; divergences are in nats.
+    """
+    divergences = kl_divergence(before, after)
+    order = divergences.argsort(descending=True)
+    count = round(EXTREMES * len(order))
+    far_inputs = (states.abs() > FAR).sum(-1).float()
+    return {
+        "exact": divergences.mean().item(),
+        "without_extremes": divergences[order[count:]].mean().item(),
+        "median": divergences.median().item(),
+        "largest": divergences.max().item(),
+        "far_inputs": far_inputs.mean().item(),
+        "far_inputs_of_extremes": far_inputs[order[:count]].mean().item(),
+        "smallest_std": after.stddev.min().item(),
+    }
 
 
 def repeat(cfg: DictConfig, path: Path, updates: int) -> Iterator[dict[str, Any]]:
     """Yield a row for each of the updates after a checkpoint."""
-    with TemporaryDirectory() as copy, ExitStack() as cleanup:
+    with TemporaryDirectory() as copy:
         cfg.training.total_frames = frames(path) + updates * cfg.training.frames_per_batch
         cfg.progress_bar = False
         cfg.checkpoint_interval = updates
         trainer = build.make_run(cfg, Path(copy))
-        cleanup.callback(trainer.source.env.close)
         checkpoint.load(trainer.checkpoint, path)
         first = trainer.progress.iteration + 1
-        trainer.update = comparison = Comparison(trainer.update)
+        comparison = Comparison(trainer.update)
+        trainer.update = comparison
         trainer.run()
         for iteration, row in enumerate(comparison.rows, first):
             yield {"method": cfg.method.name, "seed": cfg.seed, "iteration": iteration, **row, **about()}

@@ -88,7 +88,7 @@ Share = Annotated[float, Rule("a number from 0 to 1", lambda value: is_number(va
 Discount = Annotated[float, Rule("a number from 0 to 1, below 1", lambda value: is_number(value) and 0 <= value < 1)]
 Probability = Annotated[float, Rule("a number between 0 and 1", lambda value: is_number(value) and 0 < value < 1)]
 # A time between events, a number of inputs or a bound; infinite for none
-Period = Annotated[
+PositiveOrInfinite = Annotated[
     float,
     Rule(
         "a number above 0, or infinity (inf; in files and --task .inf)",

@@ -18,7 +18,7 @@ from torchrl_mcp.envs.tasks.places import LOGARITHMIC
 from torchrl_mcp.envs.tasks.ranges import Ranges
 from torchrl_mcp.envs.tasks.rewards import heading_reward, velocity_reward
 from torchrl_mcp.envs.tasks.waypoints import place_ahead, place_seen
-from torchrl_mcp.values import Count, NotNegative, Period, Range, Speed, checked
+from torchrl_mcp.values import Count, NotNegative, PositiveOrInfinite, Range, Speed, checked
 
 
 class Heading(PDCharacterEnv):
@@ -71,7 +71,7 @@ class Heading(PDCharacterEnv):
         *,
         max_turn: NotNegative = 0.15,
         speed: Speed = 1.0,
-        speed_interval: Period = 3.0,
+        speed_interval: PositiveOrInfinite = 3.0,
         waypoint: bool = False,
         initial_directions: Range = (0.0, 0.0),
         max_episode_steps: Count = 600,

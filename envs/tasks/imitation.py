@@ -24,7 +24,7 @@ from torchrl_mcp.envs.tasks.imitation_reward import (
     squared_angles,
     squared_distances,
 )
-from torchrl_mcp.values import Count, Period, Positive, checked
+from torchrl_mcp.values import Count, Positive, PositiveOrInfinite, checked
 
 NUM_TARGETS = 2
 """Number of future states of the reference in the goal (section 4)."""
@@ -113,7 +113,7 @@ class Imitation(PDCharacterEnv):
         *,
         terms: Mapping[str, Annotated[Mapping[str, float], Term]],
         max_error: Positive = 0.3,
-        switch_interval: Period = 5.0,
+        switch_interval: PositiveOrInfinite = 5.0,
         switch_candidates: Count = 1,
         switch_to: Switch = "any",
         clip_end: ClipEnd = "truncate",

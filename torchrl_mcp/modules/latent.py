@@ -16,8 +16,8 @@ class StateGoalEncoder(nn.Module):
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
         min_std: Lower bound of the standard deviation. Without a bound, the standard deviation can become tiny in
-            states that are far from most others, for example while the character falls, so that an update that hardly
-            changes the mean there has an enormous KL divergence.
+            states that are far from most others, for example while the character falls. There, even a small change of
+            the mean is then an enormous KL divergence.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808
@@ -68,6 +68,7 @@ class GoalEncoder(StateGoalEncoder):
         latent_dim: Size of the latent variable, ``L``.
         num_cells: Hidden units.
         width: Factor on all numbers of hidden units.
+        min_std: Lower bound of the standard deviation.
 
     Reference:
         Peng et al., *MCP*, NeurIPS 2019, Section E.7. https://arxiv.org/abs/1905.09808

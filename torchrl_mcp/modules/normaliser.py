@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_mcp.values import NotNegative, Period, Whole, checked
+from torchrl_mcp.values import NotNegative, PositiveOrInfinite, Whole, checked
 
 LARGEST = 1e5
 """Bound on the features of a sample, in SI units; only diverged simulations exceed it."""
@@ -44,7 +44,7 @@ class RunningNormaliser(nn.Module):
     count: Tensor
 
     @checked
-    def __init__(self, size: Whole, *, clip: Period = 10.0, epsilon: NotNegative = 1e-8) -> None:
+    def __init__(self, size: Whole, *, clip: PositiveOrInfinite = 10.0, epsilon: NotNegative = 1e-8) -> None:
         super().__init__()
         self.clip = clip
         self.epsilon = epsilon

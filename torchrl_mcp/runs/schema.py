@@ -19,8 +19,8 @@ from torchrl_mcp.values import (
     Finite,
     Names,
     NotNegative,
-    Period,
     Positive,
+    PositiveOrInfinite,
     Range,
     Seed,
     Share,
@@ -61,7 +61,7 @@ class StepSize(TypedDict):
     max: Positive
     critic: Positive
     target_kl: Positive
-    inputs: Period
+    inputs: PositiveOrInfinite
 
 
 class Objective(TypedDict):

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mcp.values import Period, Positive
+from torchrl_mcp.values import Positive, PositiveOrInfinite
 
 
 def layerwise_adam(
-    parameters: Iterable[Tensor], *, lr: Positive, inputs: Period, fused: bool, **kwargs: Any
+    parameters: Iterable[Tensor], *, lr: Positive, inputs: PositiveOrInfinite, fused: bool, **kwargs: Any
 ) -> torch.optim.Adam:
     r"""Return Adam whose step size for the weights of a layer with :math:`n` inputs is :math:`\alpha \min(1, m / n)`.
 
