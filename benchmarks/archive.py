@@ -72,9 +72,15 @@ def archived(description: str, results: Path) -> Iterator[tuple[list[Cell], Path
     elif not archive.exists():
         parser.error(f"there is no {archive}: give the folder of the runs")
     with TemporaryDirectory() as folder:
-        with tarfile.open(archive) as packed:
-            packed.extractall(folder, filter="data")
+        unpack(archive, Path(folder))
         yield cells(find_runs([Path(folder)])[0]), arguments.output
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Unpack an archive, without files outside the folder where Python can refuse them (from 3.11.4 on)."""
+    with tarfile.open(archive) as packed:
+        packed.extraction_filter = getattr(tarfile, "data_filter", None)
+        packed.extractall(folder)
 
 
 def pack(root: Path, archive: Path) -> None:

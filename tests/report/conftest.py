@@ -1,11 +1,11 @@
 import csv
 import json
-import tarfile
 from functools import cache, partial
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from archives import unpack
 from omegaconf import OmegaConf
 
 from torchrl_mcp.report.results import find_runs
@@ -115,9 +115,7 @@ def write_mcp(run_writers, tmp_path):
 @pytest.fixture(scope="session")
 def published(tmp_path_factory):
     """The published runs of Table 2: their folder, and what is read from it."""
-    folder = tmp_path_factory.mktemp("published")
-    with tarfile.open(TABLE_2 / "runs.tar.xz") as packed:
-        packed.extractall(folder, filter="data")
+    folder = unpack(TABLE_2 / "runs.tar.xz", tmp_path_factory.mktemp("published"))
     runs, damaged = find_runs([folder])
     assert not damaged
     return folder, runs

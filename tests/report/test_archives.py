@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import mean
 
 import pytest
+from archives import unpack
 from omegaconf import OmegaConf
 
 from torchrl_mcp.report.comparison import cells
@@ -26,12 +27,6 @@ def tabulate(monkeypatch, *arguments, script="table2"):
     monkeypatch.setattr(sys, "argv", [str(path), *map(str, arguments)])
     monkeypatch.syspath_prepend(str(path.parent))
     runpy.run_path(str(path), run_name="__main__")
-
-
-def unpack(archive, folder):
-    with tarfile.open(archive) as packed:
-        packed.extractall(folder, filter="data")
-    return folder
 
 
 def cells_of(markdown):
