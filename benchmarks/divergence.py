@@ -89,7 +89,7 @@ def changes(states: Tensor, before: Independent, after: Independent) -> dict[str
     """
     divergences = kl_divergence(before, after)
     order = divergences.argsort(descending=True)
-    count = round(EXTREMES * len(order))
+    count = max(1, round(EXTREMES * len(order)))
     far_inputs = (states.abs() > FAR).sum(-1).float()
     return {
         "exact": divergences.mean().item(),

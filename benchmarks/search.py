@@ -45,6 +45,9 @@ RESULTS = Path(__file__).parent / "results" / "search"
 
 STEPS_PER_CHECKPOINT = 65_536
 
+OVERSHOOT = 4.0
+"""CPU seconds by which a run may exceed its time: it is stopped once per second, and several threads may compute."""
+
 BATCHES = {"1024": (32, 1024), "4096": (128, 4096), "16384": (512, 16_384)}
 """Numbers of environments and of steps per batch, by the size of the batch."""
 
@@ -144,7 +147,6 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
         storage=JournalStorage(JournalFileBackend(str(results / "search.journal"))),
         load_if_exists=True,
         direction="maximize",
-        sampler=optuna.samplers.RandomSampler(seed=SEEDS[0]),
         pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=2, min_early_stopping_rate=0),
     )
     for trial in study.trials:
@@ -155,6 +157,8 @@ def search(task: str, method: str, root: Path, results: Path, *, seconds: float,
     if not any(trial.user_attrs.get("default") for trial in study.trials if trial.state.name != "FAIL"):
         study.enqueue_trial({}, user_attrs={"default": True})
     table = Table(results / f"{name}.csv")
+    # A search that continues draws other settings than those before the interruption.
+    study.sampler = optuna.samplers.RandomSampler(seed=SEEDS[0] + len(study.trials))
 
     def objective(trial: Any) -> float:
         settings = suggest(trial, method)
@@ -257,7 +261,7 @@ class Table:
         rows = [row for row in self.rows if row["trial"] == trial and row["seed"] == str(seed)]
         expected = (" ".join(settings), about()["commit"])
         for row in rows:
-            alike = seconds <= float(row["cpu_seconds"]) <= 1.05 * seconds + 1
+            alike = seconds <= float(row["cpu_seconds"]) <= 1.05 * seconds + OVERSHOOT
             if not alike or (row["settings"], row["commit"]) != expected:
                 raise SystemExit(
                     f"{self.path} has rows of {trial} with another commit, other settings or seconds: remove these "

@@ -250,6 +250,15 @@ def test_the_extremes_of_an_update_are_separated_from_the_other_samples(monkeypa
     assert row == pytest.approx(expected)
 
 
+def test_of_few_samples_at_least_one_is_an_extreme(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    changes = runpy.run_path(str(BENCHMARKS / "divergence.py"))["changes"]
+    means = torch.zeros(100, 1)
+    means[7] = 10.0
+    row = changes(means, Independent(Normal(torch.zeros(100, 1), 1.0), 1), Independent(Normal(means, 1.0), 1))
+    assert (row["without_extremes"], row["far_inputs_of_extremes"]) == (0.0, 1.0)
+
+
 def test_every_episode_of_a_transport_task_has_one_outcome(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     outcomes = runpy.run_path(str(BENCHMARKS / "failures.py"))["outcomes"]

@@ -216,6 +216,18 @@ def test_films_call_the_method_that_draws_an_environment_by_its_index():
     refused(env.render, "Shown", "render(index)", error=RuntimeError)
 
 
+class Undrawable(Points):
+    """Points whose drawing needs a package that is missing."""
+
+    def render(self, index):
+        raise ImportError("pygame is not installed")
+
+
+def test_drawing_that_fails_is_an_error_that_names_the_environment_and_the_reason():
+    env = OwnEnvs(Undrawable, 3, observation=["place"], max_episode_steps=4)
+    refused(env.render, "Undrawable", "pygame is not installed", error=RuntimeError)
+
+
 def test_an_observation_that_is_no_number_is_an_error_that_names_its_place():
     def corrupt(outcome):
         outcome["place"][1, 0, 1] = torch.nan
@@ -225,6 +237,15 @@ def test_an_observation_that_is_no_number_is_an_error_that_names_its_place():
     refused(
         lambda: play(env, torch.zeros(1, 3, 1)), "observation", "entry 1", "environment 1", error=FloatingPointError
     )
+
+
+def test_a_reward_that_is_no_number_is_an_error_that_names_its_place():
+    def corrupt(outcome):
+        outcome["reward"][1] = torch.inf
+        return outcome
+
+    env = adapted(Changed(act=corrupt))
+    refused(lambda: play(env, torch.zeros(1, 3, 1)), "the reward", "inf", "environment 1", error=FloatingPointError)
 
 
 def test_an_environment_that_fails_is_an_error_that_names_it_and_the_line():

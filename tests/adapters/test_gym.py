@@ -8,7 +8,7 @@ from points import LENGTH, Point, play
 from refusals import refused
 
 from torchrl_mcp.adapters.check import require_specs
-from torchrl_mcp.adapters.gym import GymnasiumEnvs
+from torchrl_mcp.adapters.gym import FRAMES_PER_SECOND, GymnasiumEnvs
 
 
 def test_each_environment_gives_gymnasiums_own_episodes_by_its_seed():
@@ -112,6 +112,12 @@ gymnasium.register(
 )
 def test_what_cannot_be_made_is_refused_with_the_reason(id, settings, names):
     refused(lambda: GymnasiumEnvs(id, 2, **settings), *names)
+
+
+@pytest.mark.parametrize("rate", [0, None])
+def test_without_a_frame_rate_a_step_takes_as_long_as_a_frame_of_a_film(rate, monkeypatch):
+    monkeypatch.setattr(Point, "metadata", {"render_fps": rate})
+    assert GymnasiumEnvs("Point-v0", 2).control_timestep == 1 / FRAMES_PER_SECOND
 
 
 class Camera(Point):

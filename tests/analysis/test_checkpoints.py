@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
+from refusals import refused
 from tensordict import TensorDict
 
-from torchrl_mcp.analysis.checkpoints import untrained
+from torchrl_mcp.analysis.checkpoints import ground, untrained
 from torchrl_mcp.analysis.walks import Walk
 from torchrl_mcp.runs import build
 from torchrl_mcp.runs.configuration import compose_run
@@ -30,3 +32,9 @@ def test_untrained_networks_see_states_through_the_normalisers_of_the_trained():
         return untrained(cfg, trained, env, walk)
 
     assert numbers(5.0, 100.0) == pytest.approx(numbers(1.0, 0.0), rel=1e-3)
+
+
+def test_environments_without_a_character_are_refused_where_its_path_would_be_drawn():
+    cfg = compose_run("preset=smoke", "task=gymnasium", "character=none", "task.pretrain.id=Pendulum-v1")
+    OmegaConf.set_struct(cfg, False)  # as read from a run folder
+    refused(lambda: ground(cfg, 2, seconds=1.0, seed=0), "GymnasiumEnvs", "character")

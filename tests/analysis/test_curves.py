@@ -95,6 +95,7 @@ def test_what_has_no_curve_is_refused(tmp_path):
     refused(lambda: learning_curves(runs | {"scratch": []}), "'scratch'")
     unfinished = write_run(tmp_path / "unfinished", [(100, 0, "nan")])
     refused(lambda: learning_curves({"mcp": [unfinished]}), str(unfinished))
+    refused(lambda: learning_curves({"mcp": [tmp_path / "elsewhere"]}), "elsewhere", "run folder")
 
 
 def test_the_written_rows_hold_the_numbers_of_the_curves(tmp_path):

@@ -131,6 +131,7 @@ def test_walkers_begin_at_different_moments_of_the_walk_and_are_asked_in_every_s
     )
     refused(lambda: record_walk(policy, env, seconds=0.5), "stride")
     assert len(follower.seen) == 15
+    refused(lambda: record_walk(policy, env, seconds=0.001), "stride")
     first, _ = follower.seen[0]
     distances = torch.cdist(first, first) + 9 * torch.eye(5)
     assert distances.min() > 0.1

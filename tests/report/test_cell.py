@@ -253,3 +253,9 @@ def test_metrics_are_means_over_seeds_of_deterministic_episodes_without_terms_of
 def test_the_speed_is_of_the_steps_that_were_taken(write_run):
     (cell,) = grouped(write_run("a", score=0.5), write_run("b", seed=1, progress=0.5))
     assert cell.speed == pytest.approx((1000 + 500) / (10 + 5))  # the runs of the fixture take 10 ms per step
+
+
+def test_whole_numbers_with_and_without_a_decimal_point_are_the_same_setting(write_run):
+    folders = [write_run("a", score=0.5, width=1), write_run("b", seed=1, score=0.5, width=1.0)]
+    (cell,) = grouped(*folders)
+    assert [run.seed for run in cell.runs] == [0, 1]

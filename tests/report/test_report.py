@@ -118,6 +118,17 @@ def test_every_task_has_learning_curves_of_its_methods(page):
     assert "environment steps" in figures[0].text
 
 
+def test_methods_whose_seeds_have_no_steps_in_common_are_listed_beside_the_plot(write_run, write_mcp, parse_page):
+    write_mcp("whole", score=0.5)
+    early, late = (write_run(name, seed=seed, progress=0.1) for seed, name in enumerate(["early", "late"]))
+    lines = (late / "metrics.csv").read_text().split()
+    (late / "metrics.csv").write_text(f"{lines[0]}\n9,1000,10,1,0.5\n")  # the rows before are lost
+    pages = report(*find_runs([early.parent]), moment=MOMENT)
+    (figure,) = section(parse_page(pages["report.html"]), "transfer").all("figure")
+    assert [item.text for item in figure.all("li")] == ["Scratch", "MCP"]
+    assert "too few episodes have ended: Scratch" in figure.text
+
+
 def test_what_is_not_complete_is_told(page):
     notes = [item.text for item in section(page, "transfer").all("li")]
     assert "note seed 1 unfinished, 25% of the steps (Scratch)" in notes

@@ -35,3 +35,8 @@ def test_diagnostics_are_means_over_seeds_and_usage_is_that_of_a_run(write_run):
 def test_gates_and_options_that_do_not_choose_are_found_out(write_run, change, group, said):
     run = read_run(write_run("a", score=0.5, diagnostics=GATES | OPTIONS | change))
     assert verdict(run, group) == said
+
+
+def test_a_single_primitive_is_not_told_that_it_does_all_the_work(write_run):
+    single = {"gates/effective_primitives": 1.0, "gates/sum": 0.5, "gates/usage_0": 0.5}
+    assert verdict(read_run(write_run("a", score=0.5, diagnostics=single)), "gates") is None

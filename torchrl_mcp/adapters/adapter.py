@@ -18,7 +18,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
 from torchrl_mcp.adapters.contract import entry_names
-from torchrl_mcp.adapters.reading import Number, Scaling, Vector
+from torchrl_mcp.adapters.reading import Number, Scaling, Vector, require_finite
 from torchrl_mcp.values import Count, Finite, Names, Positive, Range, Rule, is_list
 
 GOALS = ("desired_goal", "goal")
@@ -172,7 +172,10 @@ class Adapter(EnvBase):
         Raises:
             RuntimeError: If the environments cannot be drawn.
         """
-        picture = None if self._draw is None else self._draw(index)
+        try:
+            picture = None if self._draw is None else self._draw(index)
+        except Exception as error:  # as in a step; drawing may need a package that is not installed
+            raise RuntimeError(f"{self.name} cannot be drawn: {described(error)}") from error
         if picture is None:
             raise RuntimeError(
                 f"{self.name} cannot be drawn: it needs a render_mode of rgb_array, or a method render(index)"
@@ -255,6 +258,7 @@ class Adapter(EnvBase):
         terminated = outcome.get("terminated", torch.zeros_like(outcome["done"]))
         truncated = outcome["done"] & ~terminated | (self._elapsed >= self.max_episode_steps)
         reward = outcome["reward"].reshape(self.num_envs, 1).to(torch.float32)
+        require_finite(reward, "reward", self.name)
         return self._emit(outcome, terminated.clone(), truncated).set("reward", reward)
 
     def _reset(

@@ -75,7 +75,7 @@ class GymnasiumEnvs(Adapter):
             env.set_info_dict_reader(default_info_dict_reader(list(info), Composite(specs, shape=[num_envs])))
         known = {
             "max_episode_steps": probe.spec and probe.spec.max_episode_steps,
-            "control_timestep": 1 / probe.metadata.get("render_fps", FRAMES_PER_SECOND),
+            "control_timestep": 1 / (probe.metadata.get("render_fps") or FRAMES_PER_SECOND),
             "metrics": info,
             "render": (lambda index: batch.envs[index].render()) if batch.render_mode == RGB_ARRAY else None,
             "name": id,

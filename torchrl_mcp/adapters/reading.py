@@ -46,12 +46,7 @@ class Vector:
             return torch.zeros(self._num_envs, 0, device=outcome.device)
         parts = [outcome[key].reshape(self._num_envs, -1).to(torch.float32) for key in self.keys]
         vectors = torch.cat(parts, -1) if len(parts) > 1 else parts[0].clone()
-        if not vectors.isfinite().all():
-            number, entry = (~vectors.isfinite()).nonzero()[0].tolist()
-            raise FloatingPointError(
-                f"entry {entry} of the {self.name} became {vectors[number, entry]} in environment {number} of "
-                f"{self.owner}: correct the environment, or end the episode before"
-            )
+        require_finite(vectors, self.name, self.owner)
         return vectors
 
     def _size_of(self, key: NestedKey, spec: Composite) -> int:
@@ -68,6 +63,26 @@ class Vector:
                 f"{', '.join(map(str, observed))}. Pass {self.name}=[...] with some of them"
             )
         return math.prod(spec[key].shape[1:])
+
+
+def require_finite(vectors: Tensor, name: str, owner: str) -> None:
+    """Check what environments return.
+
+    Args:
+        vectors: One vector for each environment, ``(N, size)``.
+        name: Name of the vectors in errors.
+        owner: Name of the environments in errors.
+
+    Raises:
+        FloatingPointError: If an entry is NaN or infinite.
+    """
+    if not vectors.isfinite().all():
+        number, entry = (~vectors.isfinite()).nonzero()[0].tolist()
+        what = f"entry {entry} of the {name}" if vectors.shape[1] > 1 else f"the {name}"
+        raise FloatingPointError(
+            f"{what} became {vectors[number, entry]} in environment {number} of {owner}: correct the environment, or "
+            "end the episode before"
+        )
 
 
 def _is_image(spec: TensorSpec) -> bool:

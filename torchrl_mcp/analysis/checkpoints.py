@@ -119,6 +119,9 @@ def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[Cha
         num: Number of simulations.
         seconds: Duration of an episode in seconds.
         seed: Seed of the environments.
+
+    Raises:
+        ValueError: If the environments of the run have no character.
     """
     name = cfg.character.name
     if name in CHARACTERS:
@@ -128,6 +131,10 @@ def ground(cfg: DictConfig, num: int, *, seconds: float, seed: int) -> tuple[Cha
     else:
         plain = OmegaConf.merge(cfg, {"transforms": []})
         env = cast("CharacterEnv", build.make_env(cast("DictConfig", plain), num_envs=num, seed=seed))
+        if not isinstance(env, CharacterEnv):
+            raise ValueError(
+                f"{type(env).__name__} has no character whose path could be drawn: pass runs of characters"
+            )
         env.reset()
         start = {key: env.get_state()[key][:1].repeat(num, 1) for key in ("qpos", "qvel")}
     env.max_episode_steps = round(seconds / env.control_timestep)

@@ -140,9 +140,10 @@ def _legend(curve: Curve) -> str:
 def _points(run: Path, quantity: str) -> tuple[Array, Array, Array]:
     """Return steps, values and weights of the rows with a finite quantity, each ``(R,)``."""
     rows = read_metrics(run)
-    if not rows or quantity not in rows[0]:
-        columns = sorted(rows[0]) if rows else []
-        raise ValueError(f"{run} has no column {quantity!r} in metrics.csv: use one of its columns, {columns}")
+    if not rows:
+        raise ValueError(f"{run} has no metrics.csv with a row: pass a run folder in which an iteration has ended")
+    if quantity not in rows[0]:
+        raise ValueError(f"{run} has no column {quantity!r} in metrics.csv: use one of its columns, {sorted(rows[0])}")
     weight = "episode/count" if quantity.startswith("episode/") else None
     points = [(row["frames"], row[quantity], row[weight] if weight else 1.0) for row in rows]
     points = [point for point in points if math.isfinite(point[1])]

@@ -78,7 +78,7 @@ def record_walk(policy: TensorDictModuleBase, env: Imitation, *, seconds: float 
     running = torch.ones(env.num_envs, dtype=torch.bool)
     steps = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(round(seconds / env.control_timestep)):
+        for _ in range(max(1, round(seconds / env.control_timestep))):
             decision = policy(state.select("observation", "goal"))
             steps.append(
                 decision.select("observation", "goal", "gates", PRIMITIVES[0]).update(

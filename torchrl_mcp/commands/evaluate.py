@@ -28,7 +28,7 @@ from torchrl_mcp.training.run_folder import MODES, write_json
 PROGRAM = "torchrl-mcp-evaluate"
 
 
-@entry_point(PROGRAM)
+@entry_point(PROGRAM, FloatingPointError)
 def main(words: list[str]) -> None:
     """Play one episode in each of many environments and print the statistics."""
     arguments = parser().parse_args(words)

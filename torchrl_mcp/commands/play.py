@@ -37,7 +37,7 @@ examples:
 """
 
 
-@entry_point(PROGRAM, RuntimeError)
+@entry_point(PROGRAM, RuntimeError, FloatingPointError)
 def main(words: list[str]) -> None:
     """Write a film, or open a viewer until it is closed."""
     arguments = parse(words)

@@ -216,8 +216,13 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     names = dict.fromkeys(name for one in settings for name in one)
     groups = [{parent for name in one for parent in _parents(name)} for one in settings]
     shared = [name for name in names if all(_states(*one, name=name) for one in zip(settings, groups, strict=True))]
-    different = {name for name in shared if len({repr(one.get(name, DEFAULT)) for one in settings}) > 1}
+    different = {name for name in shared if len({comparable(one.get(name, DEFAULT)) for one in settings}) > 1}
     return [name for name in shared if name in different and different.isdisjoint(_parents(name))]
+
+
+def comparable(value: Any) -> str:
+    """Return a text that equal values of a setting share: 1 and 1.0 have the same text, 1 and true have not."""
+    return repr(float(value)) if type(value) in (int, float) else repr(value)
 
 
 def _states(settings: Mapping[str, Any], groups: Collection[str], *, name: str) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchrl_mcp.report.cell import DEFAULT, Cell, grouped, mixed, protocols, varying
+from torchrl_mcp.report.cell import DEFAULT, Cell, comparable, grouped, mixed, protocols, varying
 from torchrl_mcp.report.paper import METHODS, PLACES, Reported
 from torchrl_mcp.report.results import Run
 from torchrl_mcp.runs.identity import PRETRAINING, UNLEARNT, is_among
@@ -127,7 +127,7 @@ def _independent(names: Sequence[str], runs: Sequence[Run]) -> list[str]:
     line are returned, or else the setting with the shortest path.
     """
     given = {name for run in runs for name in run.overrides}
-    alike = grouped(names, lambda name: tuple(repr(run.settings.get(name, DEFAULT)) for run in runs)).values()
+    alike = grouped(names, lambda name: tuple(comparable(run.settings.get(name, DEFAULT)) for run in runs)).values()
     chosen = {name for group in alike for name in given.intersection(group) or [min(group, key=_depth)]}
     return [name for name in names if name in chosen]
 
@@ -150,7 +150,7 @@ def _explores(run: Run) -> bool:
 
 
 def _frozen(settings: Mapping[str, Any], names: Iterable[str] | None = None) -> Hashable:
-    return tuple((name, repr(settings.get(name, DEFAULT))) for name in (settings if names is None else names))
+    return tuple((name, comparable(settings.get(name, DEFAULT))) for name in (settings if names is None else names))
 
 
 def _order(cell: Cell) -> tuple:

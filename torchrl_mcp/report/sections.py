@@ -100,7 +100,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Plot:
-    """Learning curves, their legend, and the labels of rows without a finished episode."""
+    """Learning curves, their legend, and the labels of rows that have too few episodes for a curve."""
 
     svg: str
     lines: Sequence[Line]
@@ -255,11 +255,12 @@ def plot(title: str, rows: Sequence[Row], styles: Iterable[Mapping[str, str]], n
         return None
     figure = new_figure(4.8, 2.8)
     curves = labelled_curves([(label, paths) for paths, label, _ in drawn])
+    empty = [label for curve, (_, label, _) in zip(curves, drawn, strict=True) if not len(curve.frames)]
     plot_curves(figure.add_subplot(), curves, [{**style, "linewidth": 1.5} for *_, style in drawn])
     labels = "; ".join(curve.label for curve in curves)
     svg = inline_svg(figure, name, f"{title}: normalised return over environment steps of {labels}", PAGE_COLOURS)
     lines = [Line(label, LINES[style["color"]], DASHES[style["linestyle"]]) for _, label, style in drawn]
-    return Plot(svg, lines, [label for paths, label, _ in groups if not paths])
+    return Plot(svg, lines, [*(label for paths, label, _ in groups if not paths), *empty])
 
 
 def _styles(rows: Sequence[Row], palette: Mapping[str, str]) -> Iterator[dict[str, str]]:

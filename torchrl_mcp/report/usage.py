@@ -30,9 +30,13 @@ def usage(run: Run, group: str) -> list[float]:
 def verdict(run: Run, group: str) -> str | None:
     """Return the description of a problem with the ``gates`` or ``options`` of a run, or None."""
     values = _diagnostics(run, group)
-    if min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf)) < COLLAPSED:
+    parts = len(usage(run, group))
+    if (
+        parts > 1
+        and min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf)) < COLLAPSED
+    ):
         return f"one {PARTS[group]} does almost all the work"
-    if values.get("sum", 0.0) > WIDE_OPEN * len(usage(run, group)):
+    if values.get("sum", 0.0) > WIDE_OPEN * parts:
         return "the gates are almost fully open, so they hardly select"
     if values.get("begin_rate", 0.0) > RESTLESS:
         return "a new option begins at almost every step"
