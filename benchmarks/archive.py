@@ -218,11 +218,12 @@ def learning_curve(cell: Cell, quantity: str = NORMALISED_RETURN) -> Curve | Non
     """Return the learning curve of a cell, from the first run of each seed, in bins of the cell's steps.
 
     Runs in which no episode of full length has ended, or whose metrics lack the quantity, are omitted. If no run
-    remains, the result is None.
+    remains, or the seeds have no steps in common, the result is None.
     """
     paths = [runs[0].path for runs in cell.by_seed.values() if runs[0].has_episodes]
     paths = [path for path in paths if quantity in read_metrics(path)[0]]
-    return learning_curves({label(cell): paths}, quantity=quantity)[0] if paths else None
+    curve = learning_curves({label(cell): paths}, quantity=quantity)[0] if paths else None
+    return curve if curve and len(curve.frames) else None
 
 
 def score(cell: Cell | None) -> str:

@@ -108,7 +108,7 @@ class WarpSimulation(Simulation):
         self._run(self._step)
         ids = self._faults.nonzero().squeeze(-1)
         if len(ids):
-            self._require_room(int(self._faults[ids[0]]))
+            self._require_room(self._faults[ids])
             if not self._current:
                 self._bring_up_to_date(ids)
         return ids
@@ -220,9 +220,9 @@ class WarpSimulation(Simulation):
             after = self.outputs[name]
             after.copy_(before.index_copy(0, ids, after[ids]))
 
-    def _require_room(self, fault: int) -> None:
-        """Check that a fault is not an overflow of the memory that all simulations share for contacts."""
-        if fault & self._shared:
+    def _require_room(self, faults: Tensor) -> None:
+        """Check that no fault, ``(M,)``, is an overflow of the memory that all simulations share for contacts."""
+        if (faults & self._shared).any():
             raise RuntimeError(
                 f"{self._data.nworld} simulations have more contacts than the {self._data.naconmax} that there is room "
                 "for: pass more contacts to WarpSimulation, or take fewer environments"

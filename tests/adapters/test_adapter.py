@@ -195,6 +195,20 @@ def test_bounds_of_ones_own_are_on_the_device_of_the_environments():
     assert scaling(torch.zeros(3, 2, device="meta")).device.type == "meta"
 
 
+@pytest.mark.parametrize(("seed", "seeds"), [(5, [5, 6, 7]), (None, [None] * 3)])
+def test_a_function_that_makes_a_single_environment_receives_a_seed(seed, seeds):
+    received = []
+
+    def seeded(seed):
+        received.append(seed)
+        return single()
+
+    env = OwnEnvs(seeded, 3, seed=seed, max_episode_steps=5)
+    env.reset()
+    assert received[-3:] == seeds  # TorchRL may make one more environment before, for its specs
+    env.close()
+
+
 class Drawn(Points):
     """Points that draw the environment of an index."""
 

@@ -79,6 +79,14 @@ def test_minutes_until_four_fifths_of_the_best_return_are_those_of_the_learning_
     assert times["finetune"] is None
 
 
+def test_seeds_without_common_steps_have_no_learning_curve_and_no_minutes(write_run, archive, tmp_path):
+    for seed, returns in enumerate([("0.5", "nan"), ("nan", "0.5")]):
+        run = write_run(f"seed{seed}", seed=seed, score=0.5)
+        header, *_ = (run / "metrics.csv").read_text().split()
+        (run / "metrics.csv").write_text("{}\n1,100,1,1,{}\n2,1000,10,1,{}\n".format(header, *returns))
+    assert times_of(archive, tmp_path / "runs", "to 0.8") == {"scratch": None}
+
+
 def test_in_tasks_that_define_success_it_is_the_minutes_until_half_of_the_best_share_of_successes(
     write_run, archive, tmp_path
 ):

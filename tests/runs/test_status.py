@@ -2,6 +2,7 @@ import io
 import json
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -9,7 +10,7 @@ from rich.console import Console
 from torchrl_mcp.commands.status import main
 from torchrl_mcp.runs import benchmark, experiment, lock
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.runs.status import look, overview, status, table, write_manifest
+from torchrl_mcp.runs.status import Status, look, overview, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
 
@@ -50,6 +51,10 @@ def test_a_run_that_is_running_has_a_speed_and_an_end(runs):
     one = status(runs / "alive")
     assert (one.frames, one.total, one.speed, one.normalised_return) == (400, 1000, 50.0, 0.25)
     assert one.remaining == pytest.approx((1000 - 400) / 50)
+
+
+def test_no_time_remains_after_the_last_batch_which_may_exceed_the_total():
+    assert Status(Path("run"), "running", frames=1_200, total=1_000, speed=50.0).remaining == 0.0
 
 
 def test_the_return_is_that_of_the_evaluation_once_there_is_one(runs):

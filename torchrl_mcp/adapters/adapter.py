@@ -325,9 +325,9 @@ class OwnEnvs(Adapter):
 
     Args:
         env: Function ``env(num_envs=, seed=)`` that makes environments of batch size ``[num_envs]``. A function without
-            ``num_envs`` makes a single environment, and TorchRL's ``SerialEnv`` puts several side by side. Films call
-            the method ``render(index)`` of the environments, if there is one; it returns what :meth:`Adapter.render`
-            returns.
+            ``num_envs`` makes a single environment, and TorchRL's ``SerialEnv`` puts several side by side; if the
+            function takes a seed, the i-th environment has ``seed + i``. Films call the method ``render(index)`` of the
+            environments, if there is one; it returns what :meth:`Adapter.render` returns.
         num_envs: Number of environments.
         seed: Seed of the environments.
         **settings: Passed on to :class:`Adapter`.
@@ -342,8 +342,11 @@ class OwnEnvs(Adapter):
         maker = env.func if isinstance(env, partial) else env
         # The signature of a class of environments is that of TorchRL's metaclass.
         taken = inspect.signature(maker.__init__ if inspect.isclass(maker) else maker).parameters
-        given = {name: value for name, value in (("num_envs", num_envs), ("seed", seed)) if name in taken}
-        made = env(**given) if "num_envs" in taken else SerialEnv(num_envs, env)
+        seeds = [{"seed": None if seed is None else seed + i} if "seed" in taken else {} for i in range(num_envs)]
+        if "num_envs" in taken:
+            made = env(num_envs=num_envs, **seeds[0])
+        else:
+            made = SerialEnv(num_envs, env, create_env_kwargs=seeds)
         super().__init__(made, **{"render": _render(made), **settings})
         if seed is not None:
             self.set_seed(seed)

@@ -50,11 +50,13 @@ def walk_of(
         raise ValueError(
             f"{path} has task={cfg.task.name}, but Figure 7 shows pre-training: pass a run of task=imitation"
         )
-    _, agent, _ = policies.restore(path, num_envs=1, seed=seed)
+    _, agent, env = policies.restore(path, num_envs=1, seed=seed)
     if "gates" not in agent.actor.stored:
         raise ValueError(f"{path} has method={cfg.method.name}, which has no gate: pass a run of a method with a gate")
     clips = single_motion(cfg.character.name, clip)
-    cfg, agent, env = policies.restore(path, num_envs=walkers, seed=seed, clips=clips, switch_interval=math.inf)
+    limit = math.ceil(seconds / env.control_timestep) + 1  # the task's own limit would end the walk after 10 s
+    endless = {"switch_interval": math.inf, "max_episode_steps": limit}
+    cfg, agent, env = policies.restore(path, num_envs=walkers, seed=seed, clips=clips, **endless)
     walk = record_walk(agent.actor.policy, cast("Imitation", env), seconds=seconds)
     return walk, untrained(cfg, agent, cast("Imitation", env), walk)
 
@@ -153,7 +155,8 @@ def trajectories(path: Path, *, seed: int) -> dict[str, Trajectories]:
     """
     cfg = policies.policy_config(path)
     panels = {}
-    finished = path.is_file() or run_folder.frames(checkpoint.find(path)) >= cfg.training.total_frames
+    steps = run_folder.frames(checkpoint.find(path))
+    finished = steps < 0 or steps >= cfg.training.total_frames  # a file without a number of steps was published
     pretrained = cfg.stage.name == "pretrain"
     for shown in ("pretrain", "transfer") if pretrained else ("transfer",):
         low, high = cfg.task.directions[shown]

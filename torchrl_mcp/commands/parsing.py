@@ -137,7 +137,13 @@ def own_settings(folder: Path | None) -> list[str]:
 
 
 def own_module(name: str) -> str:
-    """Return the name of a trusted module, after making the working directory's modules importable."""
+    """Return the name of a trusted module, after making the working directory's modules importable.
+
+    Raises:
+        ArgumentTypeError: If the text is not the name of a module.
+    """
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise argparse.ArgumentTypeError(f"{name!r} is not the name of a module: write --trust MODULE, such as walker")
     find_own_modules()
     return name
 
@@ -194,15 +200,28 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 
 
 def take_trust(words: list[str]) -> tuple[list[str], list[str]]:
-    """Return the modules that a command line trusts, and the command line without them."""
+    """Return the modules that a command line trusts, and the command line without them.
+
+    Raises:
+        ValueError: If ``--trust`` lacks the name of a module.
+    """
+    with_names, kept = _split_trust(words)
+    try:
+        return [own_module(name) for name in with_names], kept
+    except argparse.ArgumentTypeError as error:
+        raise ValueError(str(error)) from error
+
+
+def _split_trust(words: list[str]) -> tuple[list[str], list[str]]:
+    """Return the words that follow ``--trust``, and the other words."""
     trusted = []
     kept = []
     rest = iter(words)
     for word in rest:
         if word == "--trust":
-            trusted.append(own_module(next(rest, "")))
+            trusted.append(next(rest, ""))
         elif word.startswith("--trust="):
-            trusted.append(own_module(word.removeprefix("--trust=")))
+            trusted.append(word.removeprefix("--trust="))
         else:
             kept.append(word)
     return trusted, kept

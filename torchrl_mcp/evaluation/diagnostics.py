@@ -17,7 +17,7 @@ DIAGNOSED = ("gates", "option", "begins")
 """Keys of samples that diagnostics may read."""
 
 COLLAPSED = 1.1
-"""Options count as collapsed into one if their effective number is at most this."""
+"""Options count as collapsed into one if their effective number is below this."""
 
 MIN_SAMPLES = 64
 """Least number of samples from which units are judged. An option that rarely acts may see fewer."""

@@ -31,10 +31,8 @@ def verdict(run: Run, group: str) -> str | None:
     """Return the description of a problem with the ``gates`` or ``options`` of a run, or None."""
     values = _diagnostics(run, group)
     parts = len(usage(run, group))
-    if (
-        parts > 1
-        and min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf)) < COLLAPSED
-    ):
+    effective = min(values.get("effective_primitives", math.inf), values.get("effective_options", math.inf))
+    if parts > 1 and effective < COLLAPSED:
         return f"one {PARTS[group]} does almost all the work"
     if values.get("sum", 0.0) > WIDE_OPEN * parts:
         return "the gates are almost fully open, so they hardly select"

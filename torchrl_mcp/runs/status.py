@@ -77,7 +77,7 @@ class Status:
     @property
     def remaining(self) -> float | None:
         """Seconds until the end of training, or None if unknown."""
-        return (self.total - self.frames) / self.speed if self.state == "running" and self.speed else None
+        return max(self.total - self.frames, 0) / self.speed if self.state == "running" and self.speed else None
 
 
 @contextmanager
