@@ -9,7 +9,7 @@ The script writes to ``results/ablations``, with the same files as in ``results/
 each variant of MCP.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -42,21 +42,28 @@ def variants(groups: Sequence[Cell]) -> list[dict[str, Any]]:
         SystemExit: If two cells of a variant differ in other settings.
     """
     transfers = [cell for cell in groups if cell.stage == "transfer" and None not in chosen(cell)]
-    imitated = {(chosen(cell, 2), cell.place[1]): completed(cell) for cell in groups if cell.stage == "pretrain"}
-    scores: dict[Any, Cell] = {}
-    for cell in transfers:
-        first = scores.setdefault((chosen(cell), cell.place), cell)
-        if first is not cell:
-            raise SystemExit(f"{label(first)} and {label(cell)} are one row of the table: archive only one of them")
+    pretrainings = [cell for cell in groups if cell.stage == "pretrain"]
+    imitated = _unique(pretrainings, lambda cell: (chosen(cell, 2), cell.place[1]))
+    scores = _unique(transfers, lambda cell: (chosen(cell), cell.place))
     places = dict.fromkeys(cell.place for cell in transfers)
     characters = dict.fromkeys(character for _, character in places)
     ends = {character: f", {character}" if len(characters) > 1 else "" for character in characters}
     return [
         dict(zip(VARIED, variant, strict=True))
-        | {f"imitation, completed{end}": imitated.get((variant[:2], name), EMPTY) for name, end in ends.items()}
+        | {f"imitation, completed{end}": completed(imitated.get((variant[:2], name))) for name, end in ends.items()}
         | {f"{task}{ends[name]}": score(scores.get((variant, (task, name)))) for task, name in places}
         for variant in sorted({chosen(cell) for cell in transfers}, key=order)
     ]
+
+
+def _unique(cells: Iterable[Cell], key: Callable[[Cell], Any]) -> dict[Any, Cell]:
+    """Return cells by key, each of which must be unique."""
+    unique: dict[Any, Cell] = {}
+    for cell in cells:
+        first = unique.setdefault(key(cell), cell)
+        if first is not cell:
+            raise SystemExit(f"{label(first)} and {label(cell)} are one row of the table: archive only one of them")
+    return unique
 
 
 def chosen(cell: Cell, count: int = len(VARIED)) -> tuple[Any, ...]:
@@ -70,8 +77,10 @@ def order(variant: tuple[Any, ...]) -> tuple[Any, ...]:
     return num_primitives, mixer == "additive", exploration == "action", trained != "gate"
 
 
-def completed(cell: Cell) -> str:
+def completed(cell: Cell | None) -> str:
     """Return the share of episodes of imitation in which the character follows its references to the end."""
+    if cell is None:
+        return EMPTY
     return f"{1 - fmean([run.evaluation['deterministic']['terminated'] for run in cell.complete]):.0%}"
 
 

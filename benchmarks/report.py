@@ -46,13 +46,17 @@ def append(path: Path, row: dict[str, Any]) -> None:
 
     The columns are those of the file; an entry that the row lacks is empty.
     """
-    if path.exists():
-        with path.open(newline="") as file:
-            columns = next(csv.reader(file))
-        with path.open("a", newline="") as file:
-            csv.DictWriter(file, columns, restval="", extrasaction="ignore").writerow(row)
-    else:
-        write(path, [row])
+    import fcntl  # only here, because Windows does not have it
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+", newline="") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        columns = next(csv.reader(file), None)
+        writer = csv.DictWriter(file, columns or list(row), restval="", extrasaction="ignore")
+        if columns is None:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 def peak_memory(pid: int) -> float:

@@ -2,6 +2,7 @@
 
 import csv
 import importlib
+import subprocess
 import sys
 from pathlib import Path
 
@@ -90,6 +91,16 @@ def test_a_row_of_a_machine_with_other_packages_is_appended_in_the_columns_of_th
     for row in ({"run": 1, "numpy": "2"}, {"run": 2, "torch": "3"}):
         append(tmp_path / "table.csv", row)
     assert (tmp_path / "table.csv").read_text().split() == ["run,numpy", "1,2", "2,"]
+
+
+def test_rows_that_processes_append_at_once_have_one_header(tmp_path):
+    path = tmp_path / "table.csv"
+    code = "import sys, report; [report.append(report.Path(sys.argv[1]), {'run': n}) for n in range(200)]"
+    processes = [subprocess.Popen([sys.executable, "-c", code, path], cwd=BENCHMARKS) for _ in range(3)]
+    assert [process.wait(60) for process in processes] == [0, 0, 0]
+    head, *rows = path.read_text().split()
+    assert head == "run"
+    assert sorted(map(int, rows)) == sorted([*range(200)] * 3)
 
 
 def test_candidates_of_imitation_begin_from_the_start(search):

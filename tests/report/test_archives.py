@@ -329,6 +329,16 @@ def test_runs_of_one_variant_that_differ_in_their_length_have_no_common_row(tmp_
         tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path, script="ablations")
 
 
+def test_two_pretrainings_of_one_variant_have_no_common_row(tmp_path, run_writers, monkeypatch):
+    _, write_mcp = run_writers(tmp_path / "runs")
+    for steps in (1_000_000, 3_000_000):
+        source = write_mcp(f"{steps}", stage="pretrain", task="imitation", score=0.5, total_frames=steps)
+        add_metrics(source, {"tracking_error": 0.05})
+    write_mcp("transfer", score=0.5)
+    with pytest.raises(SystemExit, match=r"MCP, 1\.0 M steps and MCP, 3\.0 M steps are one row"):
+        tabulate(monkeypatch, tmp_path / "runs", "--output", tmp_path, script="ablations")
+
+
 def test_pretrainings_of_other_lengths_are_told_apart(tmp_path, run_writers, monkeypatch):
     _, write_mcp = run_writers(tmp_path / "runs")
     for name, steps in (("short", 3_000_000), ("long", 10_000_000)):

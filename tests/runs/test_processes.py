@@ -51,6 +51,12 @@ def test_ticks_go_on_until_all_have_ended_and_come_once_more():
     assert running[-1] is False
 
 
+def test_a_failure_of_the_last_process_is_reported_even_if_it_ends_between_two_looks():
+    process = start(sys.exit, "a reason")
+    process.join()
+    refused(lambda: list(ticks([process], 0.1)), "failed")
+
+
 def test_a_failure_is_reported_while_others_still_run():
     processes = [start(time.sleep, 60.0), start(sys.exit, "a reason")]
     refused(lambda: list(ticks(processes, 0.1)), "failed")

@@ -68,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "holdout",
         parents=[takes("run folder or checkpoint file"), shared],
-        help="draw Figure 5: learning curves and trajectories of the ant",
+        help="draw Figure 5: learning curves, and trajectories of the ant in the first run of each method and stage",
     )
     command.set_defaults(draw=holdout)
     command = commands.add_parser(

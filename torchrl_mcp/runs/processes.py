@@ -22,12 +22,14 @@ def ticks(processes: Sequence[BaseProcess], interval: float) -> Iterator[None]:
     Raises:
         ValueError: If a process fails; the process prints the reason to standard error.
     """
-    while running := [process for process in processes if process.is_alive()]:
-        yield
-        running[0].join(interval)
+    while True:
+        running = [process for process in processes if process.is_alive()]
         if any(process.exitcode for process in processes):
             raise ValueError("a process has failed for the reason above; finished work is kept")
-    yield
+        yield
+        if not running:
+            return
+        running[0].join(interval)
 
 
 def _call(function: Callable[..., None], *args: Any) -> None:

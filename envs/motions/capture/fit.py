@@ -133,6 +133,8 @@ def fit_clip(
     if clip.character == character:
         if joint_map or bodies:
             raise ValueError(f"{path} already is of character={character} and needs no map: leave the map out")
+        if skip > len(clip.qpos) - 2:
+            raise ValueError(f"skip={skip} leaves less than two frames of {len(clip.qpos)}: pass a smaller number")
         clip = clip.section(skip / clip.fps, clip.duration) if skip else clip
         if rate is not None:
             require_frames(clip.duration, rate)

@@ -105,7 +105,7 @@ def _table(file: TextFile) -> tuple[Tensor, list[str] | None, None]:
 def _words(line: str) -> list[str]:
     """Split a line at semicolons, beside which commas are of decimals, or else at commas and blanks."""
     line = line.strip().rstrip(",;")
-    return re.split(r"\s*;\s*" if ";" in line else r"\s*,\s*|\s+", line)
+    return re.split(r"\s*;\s*", line.replace(",", ".")) if ";" in line else re.split(r"\s*,\s*|\s+", line)
 
 
 def _root_order(file: TextFile, names: Sequence[str], quaternion: str | None) -> str | None:

@@ -38,6 +38,13 @@ def test_frames_are_left_out_at_its_beginning(file):
     torch.testing.assert_close(found.qpos, clip.qpos[5:], atol=1e-9, rtol=0)
 
 
+def test_a_clip_of_which_no_two_frames_remain_is_refused(file):
+    frames = len(turning_clips("humanoid")["left_sharp"].qpos)
+    assert len(import_motion(file, "humanoid", rate=30.0, skip=frames - 2).qpos) >= 2
+    with pytest.raises(ValueError, match=rf"skip={frames - 1} leaves less than two frames of {frames}"):
+        import_motion(file, "humanoid", skip=frames - 1)
+
+
 @pytest.mark.parametrize("options", [{"fps": 10.0}, {"joint_map": {"left_knee": "shin"}}])
 def test_options_that_would_change_nothing_are_refused(file, options):
     with pytest.raises(ValueError, match=r"leave (it|the map) out"):
