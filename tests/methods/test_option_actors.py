@@ -12,7 +12,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl_mcp.evaluation.diagnostics import diagnostics
 from torchrl_mcp.methods.actor import Sizes
 from torchrl_mcp.methods.hierarchical import gated_actor, gated_parts, primitive_actor, primitive_parts
-from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts
+from torchrl_mcp.methods.option_critic import option_critic_actor, option_critic_parts, option_values
 from torchrl_mcp.methods.options import SeparateOptions, Terminations
 from torchrl_mcp.modules import GaussianPolicy, JointGating, Primitives
 from torchrl_mcp.runs.configuration import compose_run
@@ -219,3 +219,9 @@ def test_terminations_stay_random_in_deterministic_play():
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         rate = actor.policy(many)["begins"].float().mean().item()
     assert rate == pytest.approx(0.3, abs=0.04)  # 4,800 draws: six standard errors
+
+
+def test_primitives_and_parts_of_another_method_are_refused_with_the_choice_that_fits():
+    trunk = partial(Primitives, trunk_cells=(16, 8), branch_cells=0, initial_std=0.3)
+    refused(lambda: primitive_parts(Sizes(S, G, A), primitives=trunk, num_options=K), "primitives=separate")
+    refused(lambda: option_values(hierarchical()[0], Sizes(S, G, A)), "critic", "terminations", "critic=mlp")

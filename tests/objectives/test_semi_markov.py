@@ -170,6 +170,7 @@ def test_a_batch_without_choices_is_refused():
     batch = trajectories([[1.0, 1.0]], [[0.0, 0.0, 0.0]], [[GOES_ON, GOES_ON]], [[False, False]])
     advantages = SemiMarkovAdvantages(critic(), gamma=0.9, lmbda=0.9, clip=4.0)
     refused(lambda: advantages(batch), "training.frames_per_batch", "batch_factor", "training.num_envs")
+    refused(lambda: advantages(batch.exclude("begins")), "begins")
 
 
 def two_choices_in_each_of_four_rows():

@@ -7,19 +7,22 @@ import zipfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import smoke
 import torch
 from omegaconf import OmegaConf
 from refusals import contents, refused
-from smoke import rows
+from smoke import final_parts, rows
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchrl_mcp.envs import characters
+from torchrl_mcp.envs.motions.trex import trex_corpus
 from torchrl_mcp.runs import build, experiment, lock, policies
 from torchrl_mcp.runs.status import status
 from torchrl_mcp.training import checkpoint, run_folder
+from torchrl_mcp.training.trainer import Trainer
 
 EVERY = ["training.total_frames=640", "checkpoint_interval=1", "keep_checkpoints=9"]
 SHORT = "training.total_frames=128"
@@ -70,6 +73,33 @@ def test_a_run_does_not_go_on_with_another_body(tmp_path, monkeypatch):
     body.write_text(body.read_text() + "<!-- stronger -->")
     refused(lambda: experiment.resume(run, total_frames=256), "character=biped", untouched=run)
     refused(lambda: experiment.train(configure(run, *settings)), "character", untouched=run)
+
+
+@pytest.mark.parametrize("afterwards", [partial(experiment.resume, total_frames=256), shutil.rmtree])
+def test_a_run_killed_before_its_first_step_keeps_the_networks_with_which_it_began(tmp_path, monkeypatch, afterwards):
+    pretraining = experiment.train(configure(tmp_path / "pretraining", "task=holdout", "method=mcp", SHORT))
+    settings = ["task=holdout", "method=mcp", "stage=transfer", f"pretrained={pretraining}", SHORT]
+    whole = experiment.train(configure(tmp_path / "whole", *settings))
+    with monkeypatch.context() as kill:
+        kill.setattr(Trainer, "run", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            experiment.train(configure(tmp_path / "killed", *settings))
+    afterwards(pretraining)
+    killed = experiment.resume(tmp_path / "killed")
+    assert rows(killed) == rows(whole)
+    torch.testing.assert_close(final_parts(killed), final_parts(whole), rtol=0, atol=0)
+
+
+def test_a_run_does_not_go_on_with_other_motions(tmp_path):
+    first, second = trex_corpus()[:2]
+    (tmp_path / "clips").mkdir()
+    first.save(tmp_path / "clips/walk.npz")
+    settings = ["task=imitation", "character=trex", "method=scratch", "stage=pretrain", "motions=folder"]
+    run = experiment.train(configure(tmp_path / "run", *settings, f"motions.path={tmp_path / 'clips'}", SHORT))
+    second.save(tmp_path / "clips/run.npz")
+    refused(lambda: experiment.resume(run, total_frames=256), "motions.path", untouched=run)
+    (tmp_path / "clips/run.npz").unlink()
+    assert run_folder.frames(checkpoint.find(experiment.resume(run, total_frames=256))) == 256
 
 
 def test_a_resume_that_fails_leaves_the_run_as_it_was(whole):

@@ -2,6 +2,7 @@ import io
 import json
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from rich.console import Console
 from torchrl_mcp.commands.status import main
 from torchrl_mcp.runs import benchmark, experiment, lock
 from torchrl_mcp.runs.configuration import compose_run
-from torchrl_mcp.runs.status import Status, look, overview, status, table, write_manifest
+from torchrl_mcp.runs.status import Status, look, overview, read_manifest, status, table, write_manifest
 
 HEADER = "iteration,frames,seconds,episode/normalised_return,time/steps_per_second\n"
 
@@ -77,6 +78,14 @@ def test_parts_of_a_benchmark_that_are_started_one_after_the_other_are_all_plann
         "carry": ("waiting", 1000),
         "heading": ("waiting", 500),
     }
+
+
+def test_parts_of_a_benchmark_that_are_started_together_are_all_planned(tmp_path):
+    manifest = tmp_path / "multirun" / "benchmark-x.json"
+    planned = {tmp_path / str(number): number for number in range(16)}
+    with ThreadPoolExecutor(4) as processes:
+        list(processes.map(lambda run: write_manifest({run: planned[run]}, manifest), planned))
+    assert read_manifest(manifest) == planned
 
 
 @pytest.mark.parametrize("blank", ["nan", ""])

@@ -77,6 +77,28 @@ def test_a_batch_may_divide_only_with_its_factor():
     require_valid(composed(*place("hierarchical", "heading"), "training.num_envs=8", "training.minibatch_size=32768"))
 
 
+def test_a_batch_that_may_contain_no_choice_is_refused():
+    words = ["training.num_envs=512", "training.frames_per_batch=4096"]
+    require_valid(composed(*place("hierarchical", "heading"), *words, "steps_per_choice=64"))
+    longer = composed(*place("hierarchical", "heading"), *words, "steps_per_choice=65")
+    refused(lambda: require_valid(longer), "steps_per_choice=65", "training.num_envs", "training.frames_per_batch")
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["method=mcp", "task=imitation", "primitives=separate"], ["primitives.initial_std"]),
+        (["method=scratch", "task=gymnasium", "preset=paper"], ["step_size.actor=..."]),
+    ],
+)
+def test_a_reference_to_a_setting_that_the_chosen_groups_lack_is_named(words, names):
+    refused(lambda: require_valid(composed(*words)), *names)
+
+
+def test_a_run_from_python_is_asked_for_its_folder():
+    refused(lambda: require_valid(compose_run("method=scratch", "task=holdout")), "run_dir=FOLDER")
+
+
 WRONG = {
     "seed": ["null", "-1", "1.5", "many", str(2**32)],
     "training.num_envs": ["0", "1.5", "null", "-4", "[1]"],
@@ -96,7 +118,7 @@ WRONG = {
     "objective.advantages.lmbda": ["1.5", "-1"],
     "objective.advantages.clip": ["0", "-4"],
     "objective.max_grad_norm": ["-1", "0", ".nan", ".inf"],
-    "objective.loss.clip_epsilon": ["-1", "0", "wide"],
+    "objective.loss.clip_epsilon": ["-1", "0", "1", "1.5", "wide"],
     "objective.loss.bound_coeff": ["-1"],
     "optimizer.actor.lr": ["0", "-1e-3", "nan", "fast"],
     "optimizer.actor.fused": ["2"],

@@ -3,14 +3,16 @@
 from types import SimpleNamespace
 
 import pytest
+import smoke
 import torch
 from refusals import refused
 from tensordict import TensorDict
 from torch import nn
 
 from torchrl_mcp.objectives import ActorLoss
-from torchrl_mcp.runs import build
+from torchrl_mcp.runs import build, experiment
 from torchrl_mcp.runs.configuration import compose_run
+from torchrl_mcp.runs.trust import trusting
 from torchrl_mcp.training.update import Objective, PPOSettings, Update
 
 
@@ -47,6 +49,22 @@ def updated(folder, max_grad_norm):
     with torch.no_grad():
         batch = source.env.rollout(8, agent.actor.policy, break_when_any_done=False)
     return losses, divergences, Update(agent, objective, trainer.settings)(batch, warming_up=False)
+
+
+class PolicyGradient(ActorLoss):
+    """The policy gradient of whatever the policy samples, without clipping."""
+
+    out_keys = ("loss_objective", "mean_ratio", "kl_approx")
+
+    def __init__(self, policy):
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, samples):
+        log_prob = self.policy.get_dist(samples).log_prob(samples[self.sampled])
+        log_ratio = log_prob - samples[self.log_prob]
+        terms = {"mean_ratio": log_ratio.exp().mean(), "kl_approx": -log_ratio.mean()}
+        return TensorDict({"loss_objective": -(log_prob * samples["advantage"].squeeze(-1)).mean(), **terms})
 
 
 class Numbered:
@@ -90,6 +108,17 @@ def test_the_step_size_follows_the_divergence_of_the_last_epoch(tmp_path):
     # E[r - 1 - log r]: 0.2 less 0.1 for each of the calls so far, of which 9 to 12 are the last epoch's.
     assert metrics["loss/kl"] == pytest.approx(0.1 * (9 + 10 + 11 + 12) / 4, rel=1e-4)
     assert divergences == [metrics["loss/kl"]]
+
+
+@pytest.mark.parametrize("method", [["method=scratch"], ["method=mcp", "exploration=weights", "pretrained=builtin"]])
+def test_a_loss_of_a_users_own_trains_a_run_by_its_name_alone(tmp_path, method):
+    loss = f"{{_target_: {__name__}.PolicyGradient, _partial_: true}}"
+    settings = ["task=heading", "character=biped", "stage=transfer", "~objective.loss", f"+objective.loss={loss}"]
+    with trusting({__name__}):
+        folder = experiment.train(smoke.configure(tmp_path / "run", *settings, *method))
+    for row in smoke.rows(folder):
+        assert float(row["loss/loss_objective"]) != 0
+        assert float(row["loss/actor_grad_norm"]) > 0
 
 
 def test_a_loss_that_does_not_declare_its_reports_is_refused_by_name_before_training():

@@ -1,6 +1,7 @@
 """The hierarchical baseline: a gate picks one of K primitives and keeps it for a walk cycle (Section E.4)."""
 
 from collections.abc import Callable, Collection
+from inspect import signature
 
 import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
@@ -22,13 +23,18 @@ def primitive_parts(sizes: Sizes, *, primitives: Callable[..., nn.Module], num_o
 
     Returns:
         The parts by name.
+
+    Raises:
+        ValueError: If the primitives are not called with a state and an option.
     """
-    return nn.ModuleDict(
-        {
-            **input_normalisers(sizes),
-            "primitives": primitives(sizes.observation, sizes.action, num_options),
-        }
-    )
+    networks = primitives(sizes.observation, sizes.action, num_options)
+    try:
+        signature(networks.forward).bind("state", "option")
+    except TypeError as error:
+        raise ValueError(
+            f"{type(networks).__name__} does not take a state and an option: pass primitives=separate"
+        ) from error
+    return nn.ModuleDict({**input_normalisers(sizes), "primitives": networks})
 
 
 def gated_parts(

@@ -149,7 +149,12 @@ def option_values(parts: nn.ModuleDict, sizes: Sizes) -> TensorDictSequential:
 
     Returns:
         The module. ``option_values`` and ``terminations`` have the shape ``(*B, K)``.
+
+    Raises:
+        ValueError: If the parts lack ``critic`` or ``terminations``.
     """
+    if missing := {"critic", "terminations"} - set(parts):
+        raise ValueError(f"the method has no part {' or '.join(sorted(missing))}: use critic=mlp, as for policies")
     return TensorDictSequential(
         normalise_inputs(parts),
         TensorDictModule(parts["critic"], in_keys=[STATE, GOAL], out_keys=["option_values"]),

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictParams, dispatch
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -25,8 +25,14 @@ class ActorLoss(nn.Module):
     - ``mean_ratio`` is :math:`E[r]`.
     - ``kl_approx`` is :math:`-E[\log r]`, in nats.
 
+    A run makes the loss from the part of the policy that learns, ``Actor.trained``, and then calls :meth:`set_keys`.
+    On the command line, ``~objective.loss '+objective.loss={_target_: my_losses.PolicyGradient, _partial_: true}'``
+    replaces the loss of PPO.
+
     Attributes:
         out_keys: Names of all outputs.
+        sampled: Key of what the policy samples: the action or, for example, the logits of the gate.
+        log_prob: Key of its log-probability under the policy that collected it.
 
     Example:
         The policy gradient without clipping:
@@ -36,13 +42,13 @@ class ActorLoss(nn.Module):
         >>> class PolicyGradient(ActorLoss):
         ...     out_keys = ["loss_objective", "mean_ratio", "kl_approx"]
         ...
-        ...     def __init__(self, actor):
+        ...     def __init__(self, policy):
         ...         super().__init__()
-        ...         self.actor = actor
+        ...         self.policy = policy
         ...
         ...     def forward(self, samples):
-        ...         log_prob = self.actor.trained.get_dist(samples).log_prob(samples["action"])
-        ...         log_ratio = log_prob - samples["action_log_prob"]
+        ...         log_prob = self.policy.get_dist(samples).log_prob(samples[self.sampled])
+        ...         log_ratio = log_prob - samples[self.log_prob]
         ...         return TensorDict(
         ...             loss_objective=-(log_prob * samples["advantage"].squeeze(-1)).mean(),
         ...             mean_ratio=log_ratio.exp().mean(),
@@ -51,6 +57,13 @@ class ActorLoss(nn.Module):
     """
 
     out_keys: list[str]
+    sampled: NestedKey = "action"
+    log_prob: NestedKey = "action_log_prob"
+
+    def set_keys(self, *, action: NestedKey, sample_log_prob: NestedKey) -> None:
+        """Set :attr:`sampled` and :attr:`log_prob`, which TorchRL's losses call ``action`` and ``sample_log_prob``."""
+        self.sampled = action
+        self.log_prob = sample_log_prob
 
 
 def require_reports(loss: nn.Module) -> None:

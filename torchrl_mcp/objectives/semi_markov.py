@@ -66,8 +66,10 @@ class SemiMarkovAdvantages:
         """Return the C choices of trajectories ``(*B, T)``, with ``advantage`` and ``value_target``, each ``(C, 1)``.
 
         Raises:
-            ValueError: If the trajectories contain no choice.
+            ValueError: If the trajectories contain no choice, or their policy makes none.
         """
+        if "begins" not in batch:
+            raise ValueError("the policy stores no 'begins', because it makes no choices: use the objective of ppo")
         begins = batch["begins"]
         if not begins.any():
             raise ValueError(

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_mcp.adapters.check import require_specs
 from torchrl_mcp.evaluation.rollout import episode_statistics, evaluate
 from torchrl_mcp.runs import build, lock, places, records
-from torchrl_mcp.runs.configuration import Plan, initial_networks, planned
+from torchrl_mcp.runs.configuration import Plan, planned
 from torchrl_mcp.runs.policies import evaluation
 from torchrl_mcp.runs.records import is_complete
 from torchrl_mcp.runs.requirements import require_all, require_executable
@@ -137,7 +137,7 @@ def _resume(folder: Path, device: str | None, total_frames: int | None, moves: M
         print(f"{folder} is complete: nothing remains to be done", flush=True)
         records.store(folder, config)
         return folder
-    records.require_same_character(folder, config)
+    records.require_same_inputs(folder, config)
     cfg.device = device or cfg.device
     require_executable(cfg)
     print(f"{folder} continues{records.elsewhere(folder, cfg)}", flush=True)
@@ -152,14 +152,10 @@ def _restored(cfg: DictConfig, folder: Path) -> Trainer:
     saved = run_folder.find_all(folder) or [checkpoint.find(folder)]
     path = next((path for path in saved if checkpoint.is_intact(path)), saved[0])
     records.require_same_run(cfg, path)
-    if run_folder.frames(path):
-        trainer = build.make_run(cfg, folder)
-        trainer.restore(path)
-        if not trainer.source.resumes_episodes:
-            print("the run begins new episodes, because checkpoints lack the state of its environments", flush=True)
-    else:  # the environments had not been reset yet, so the checkpoint lacks their state
-        trainer = build.make_run(cfg, folder, initial_networks(cfg))
-        trainer.folder.metrics.rewind(0)
+    trainer = build.make_run(cfg, folder)
+    trainer.restore(path)
+    if run_folder.frames(path) and not trainer.source.resumes_episodes:
+        print("the run begins new episodes, because checkpoints lack the state of its environments", flush=True)
     for damaged in saved[: saved.index(path)]:
         print(f"{damaged} is damaged: the run continues from {path.name}, the newest intact checkpoint", flush=True)
         checkpoint.set_aside(damaged)

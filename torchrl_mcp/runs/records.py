@@ -96,23 +96,26 @@ def require_free(folder: Path, config: Mapping[str, Any]) -> None:
         )
 
 
-def require_same_character(folder: Path, config: Mapping[str, Any]) -> None:
-    """Check that the file of a user's character has not changed since the run began.
+def require_same_inputs(folder: Path, config: Mapping[str, Any]) -> None:
+    """Check that the files that a run reads again, such as motions or a character, have not changed since it began.
+
+    Pre-trained networks may change, because the checkpoints of the run contain them.
 
     Args:
         folder: The run folder.
         config: The run's configuration.
 
     Raises:
-        ValueError: If the file has changed.
+        ValueError: If a file has changed.
     """
-    current = places.digests(config).get("character")
-    recorded = _origin(folder).get("inputs", {}).get("character")
-    if None not in (current, recorded) and current != recorded:
-        name = config["character"]["name"]
-        raise ValueError(
-            f"the file of character={name} has changed since {folder} began: restore the file, or start a new run"
-        )
+    recorded = _origin(folder).get("inputs", {})
+    for setting, mark in places.digests(config).items():
+        if setting.rpartition(".")[2] != places.PRETRAINED and recorded.get(setting, mark) != mark:
+            value = config["character"]["name"] if setting == "character" else places.outside(config)[setting]
+            raise ValueError(
+                f"the content of {setting}={value} has changed since {folder} began: restore the content, or start a "
+                "new run"
+            )
 
 
 def begin(folder: Path, config: Mapping[str, Any], precision: Precision) -> None:

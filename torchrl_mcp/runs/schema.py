@@ -21,6 +21,7 @@ from torchrl_mcp.values import (
     NotNegative,
     Positive,
     PositiveOrInfinite,
+    Probability,
     Range,
     Seed,
     Share,
@@ -157,7 +158,7 @@ class RunSettings(TypedDict):
     std_gain: Positive
     action_std: Positive
     learned_std: bool
-    clip_epsilon: Positive
+    clip_epsilon: Probability  # PPO takes the logarithm of 1 - clip_epsilon
     entropy_coeff: NotNegative
     lmbda: Share
     epsilon: Share
@@ -181,7 +182,7 @@ class Optimizer(TypedDict):
 class ClipPPOLoss(TypedDict):
     """Arguments of TorchRL's ``ClipPPOLoss`` and of its subclasses."""
 
-    clip_epsilon: Positive
+    clip_epsilon: Probability  # PPO takes the logarithm of 1 - clip_epsilon
     entropy_bonus: bool
     functional: bool
 

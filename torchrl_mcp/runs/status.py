@@ -135,13 +135,14 @@ def write_manifest(runs: Mapping[Path, int], path: Path) -> None:
 
     The file keeps the runs of earlier commands, which may have trained other parts of the benchmark.
     """
-    try:
-        earlier = read_manifest(path) if path.exists() else {}
-    except UNREADABLE:
-        earlier = {}
     folder = path.parent.resolve()
-    steps = {os.path.relpath(run.resolve(), folder): total for run, total in {**earlier, **runs}.items()}
-    write_json(steps, path)
+    with lock.hold(folder, wait=True):  # another benchmark may write the same file
+        try:
+            earlier = read_manifest(path) if path.exists() else {}
+        except UNREADABLE:
+            earlier = {}
+        steps = {os.path.relpath(run.resolve(), folder): total for run, total in {**earlier, **runs}.items()}
+        write_json(steps, path)
 
 
 def read_manifest(path: Path) -> dict[Path, int]:

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from torchrl_mcp.runs.arguments import argument_types
 from torchrl_mcp.runs.schema import Evaluation, RunSettings, Task
 from torchrl_mcp.runs.settings import is_group, items, leaves
 from torchrl_mcp.values import GROUP, Rule, is_group_type, rule_of, shown, type_of_entry, types_of
+
+TABLE = "method.paper."
+"""Prefix of the settings that ``preset=paper`` reads, which not every method has for every character."""
 
 
 def require_valid(cfg: DictConfig) -> None:
@@ -37,6 +40,7 @@ def require_valid(cfg: DictConfig) -> None:
         wrong += _step_size_out_of_range(config["step_size"]["actor"], schedule)
     if not wrong:
         wrong += _uneven_batch(config["training"], config.get("batch_factor", 1))
+        wrong += _short_batch(config["training"], config.get("batch_factor", 1), config["actor"])
         wrong += _wrong_folders(str(config["run_dir"]), str(config["run_root"]))
     if wrong:
         raise ValueError("\n".join(wrong))
@@ -50,7 +54,16 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
     """
     try:
         return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+    except InterpolationKeyError as error:
+        missing = str(error).partition("'")[2].partition("'")[0]
+        setting = error.full_key or "a setting"
+        remedy = f"pass {setting}=..., or choose another group" if missing.startswith(TABLE) else "choose another group"
+        raise ValueError(f"{setting} refers to {missing}, which the chosen groups lack: {remedy}") from error
     except OmegaConfBaseException as error:
+        if "HydraConfig" in str(error):
+            raise ValueError(
+                "run_dir has a default only in torchrl-mcp-train, which names it after settings: pass run_dir=FOLDER"
+            ) from error
         raise ValueError(f"the settings contradict each other: {str(error).partition(chr(10))[0]}") from error
 
 
@@ -166,6 +179,22 @@ def _uneven_batch(training: Mapping[str, Any], factor: int) -> Iterator[str]:
         yield (
             f"training.frames_per_batch={frames}{product} must be a multiple of training.num_envs={num_envs} and of "
             f"training.minibatch_size={minibatch_size}"
+        )
+
+
+def _short_batch(training: Mapping[str, Any], factor: int, actor: Mapping[str, Any]) -> Iterator[str]:
+    """Yield an error message if a batch may contain no choice of an actor that chooses every few steps.
+
+    Args:
+        training: The settings ``training``.
+        factor: Factor on ``training.frames_per_batch``.
+        actor: The settings of the actor.
+    """
+    steps = training["frames_per_batch"] * factor // training["num_envs"]
+    if steps < (lasting := actor.get("steps_per_choice", 1)):
+        yield (
+            f"steps_per_choice={lasting} must be at most {steps}, the steps of an environment in a batch: lower "
+            "training.num_envs, or raise training.frames_per_batch"
         )
 
 

@@ -71,8 +71,13 @@ def run_checkpoint(parts: nn.ModuleDict, **components: Any) -> Checkpoint:
     return Checkpoint(format="archive", **{_component(name): part for name, part in parts.items()}, **components)
 
 
-def load(checkpoint: Checkpoint, path: Path) -> None:
+def load(checkpoint: Checkpoint, path: Path, components: Collection[str] | None = None) -> None:
     """Restore ``checkpoint`` from the file ``path``.
+
+    Args:
+        checkpoint: The objects to restore.
+        path: The file.
+        components: Names of the objects to restore, or None for all.
 
     Raises:
         ValueError: If the file is missing, damaged, of another kind, or written for other networks.
@@ -84,7 +89,7 @@ def load(checkpoint: Checkpoint, path: Path) -> None:
     torchrl_logger.setLevel(ERROR)  # otherwise TorchRL warns even of another build of the same version, such as +cu128
     try:
         _require_plain_data(path)
-        report = checkpoint.load(path, map_location="cpu")
+        report = checkpoint.load(path, components=components, map_location="cpu")
     except UNREADABLE as error:
         _raise_passing(error)
         raise ValueError(

@@ -15,8 +15,11 @@ from torchrl_mcp.training.checkpoint import RunRandomness, load, rotation, run_c
 from torchrl_mcp.training.collectors import Batches, TrajectorySource
 from torchrl_mcp.training.metrics import EpisodeStatistics, MetricsWriter
 from torchrl_mcp.training.progress import Progress, Stopwatch, TrainingBar
-from torchrl_mcp.training.run_folder import NORMALISED_RETURN
+from torchrl_mcp.training.run_folder import NORMALISED_RETURN, frames
 from torchrl_mcp.training.update import Agent, Objective, PPOSettings, Update
+
+ENVIRONMENT = "environment"
+"""Name of the state of the trajectory source in a checkpoint."""
 
 
 class RunFolder:
@@ -68,7 +71,7 @@ class Trainer:
         self.checkpoint: Checkpoint = run_checkpoint(
             agent.parts,
             **{f"{name}_optimizer": optimizer for name, optimizer in objective.optimizers.items()},
-            environment=source,
+            **{ENVIRONMENT: source},
             episodes=self.episodes,
             frozen=agent.frozen,
             progress=self.progress,
@@ -109,11 +112,15 @@ class Trainer:
     def restore(self, path: Path) -> None:
         """Continue from the checkpoint file ``path``, bit for bit if the trajectory source resumes its episodes.
 
+        In the checkpoint of a run that has not taken a step, the environments have no state yet. They begin anew, with
+        the seed of the run.
+
         Raises:
             ValueError: If the file is damaged or belongs to another configuration, or if ``metrics.csv`` ends before
                 the checkpoint. Nothing is written in these cases.
         """
-        load(self.checkpoint, path)
+        components = set(self.checkpoint.components)
+        load(self.checkpoint, path, components if frames(path) else components - {ENVIRONMENT})
         if not self.source.resumes_episodes:
             self.episodes.load_state_dict(EpisodeStatistics(self.source.num_envs).state_dict())
         self.folder.metrics.rewind(self.progress.iteration)
