@@ -56,7 +56,7 @@ def runs(request, tmp_path_factory):
     folder, (name, (pretraining, transfer)) = tmp_path_factory.mktemp("runs"), CASES[request.param]
     method = f"method={name}"
     transfer = [method, "stage=transfer", *transfer, "training.total_frames=128", "checkpoint_interval=1"]
-    transfer.append("++batch_factor=1")
+    transfer += ["++batch_factor=1", "++steps_per_choice=16"]
     if not configure(folder, *transfer).transfer.keep:
         return None, experiment.train(configure(folder / "transfer", *transfer))
     pretrained = experiment.train(configure(folder / "pretrain", method, "stage=pretrain", *pretraining))

@@ -37,6 +37,7 @@ PLACE = "runs/test_validation.py::test_no_setting_takes_a_run_out_of_the_folder_
 KEY = "runs/test_keys.py::test_a_setting_that_is_misspelt_or_in_a_wrong_group_is_named"
 BODY = "runs/test_faults.py::test_a_run_does_not_go_on_with_another_body"
 BITS = "training/test_trainer.py::test_a_run_continues_in_or_after_its_warm_up_to_the_same_numbers_bit_for_bit"
+FIRST = "runs/test_faults.py::test_a_run_killed_before_its_first_step_keeps_the_networks_with_which_it_began"
 NETWORKS = "runs/test_places.py::test_folders_of_other_networks_have_other_names_wherever_those_are"
 LONGER = "runs/test_places.py::test_a_longer_run_goes_on_from_another_folder_after_a_move_as_one_that_was_planned"
 
@@ -166,6 +167,7 @@ FAULTS = {
         ("excess.square().sum(-1)", "excess.square().mean(-1)", "objectives/test_ppo.py"),
         ("entropy_bonus and entropy_coeff != 0", "entropy_bonus", "objectives/test_ppo.py"),
         ("if target.shape != values.shape", "if False", "objectives/test_values.py"),
+        ("self.sampled = action", "pass", "training/test_update.py"),
     ],
     "torchrl_mcp/objectives/advantages.py": [
         ("    cut[..., -1] = True\n", "", "objectives/test_advantages.py"),
@@ -363,6 +365,7 @@ FAULTS = {
     ],
     # Training
     "torchrl_mcp/training/trainer.py": [
+        ("components if frames(path) else", "components if True else", FIRST),
         (
             "self.progress.iteration < self.settings.warmup_batches",
             "self.progress.iteration <= self.settings.warmup_batches",
@@ -541,6 +544,7 @@ FAULTS = {
     "torchrl_mcp/runs/status.py": [
         ("if frames >= total:  #", "if True:  #", "runs/test_status.py"),
         ("{**earlier, **runs}", "runs", "runs/test_status.py"),
+        ("with lock.hold(folder, wait=True):", "if True:", "runs/test_status.py"),
         ('line.count(",") == names.count(",")', 'line.count(",")', "runs/test_status.py"),
         ("run_folder.frames(path) >= total", "run_folder.frames(path) > total", "runs/test_status.py"),
     ],
@@ -572,7 +576,7 @@ FAULTS = {
             "if False and total <",
             "runs/test_faults.py::test_a_resume_to_the_length_that_was_planned_ends_a_run_of_whole_batches",
         ),
-        ("if None not in (current, recorded) and current != recorded", "if False", BODY),
+        ("recorded.get(setting, mark) != mark", "False", BODY),
     ],
     "torchrl_mcp/runs/places.py": [("member.CRC) for member", "member.file_size) for member", NETWORKS)],
     # Validation of settings
@@ -601,6 +605,11 @@ FAULTS = {
             "runs/test_validation.py::test_a_batch_that_does_not_divide_is_refused_with_the_numbers_of_the_settings",
         ),
         ('if path.startswith("~")', "if False", PLACE),
+        (
+            "if steps < (lasting",
+            "if steps < 0 * (lasting",
+            "runs/test_validation.py::test_a_batch_that_may_contain_no_choice_is_refused",
+        ),
         ('if value == "???"', "if False", "runs/test_validation.py::test_a_missing_value_is_asked_for"),
         ("if not home and _escapes", "if False and _escapes", PLACE),
         ("is_group(value) and (rule is None or rule.allows(value))", "is_group(value)", GROUP),

@@ -91,7 +91,7 @@ def commit(folder: Path, *, results: Path | None = None) -> str | None:
     # An installed package may lie inside the checkout of another project, which does not track the package.
     if not _git(folder, "ls-files", "."):
         return None
-    head = _git(folder, "describe", "--always", "--exclude=*")
+    head = _git(folder, "describe", "--always", "--abbrev=7", "--exclude=*")
     ignored = [f":(exclude){results}"] if results else []
     return f"{head}-dirty" if _git(folder, "diff", "--name-only", "HEAD", "--", ":/", *ignored) else head
 

@@ -18,9 +18,6 @@ from torchrl_mcp.training.progress import Progress, Stopwatch, TrainingBar
 from torchrl_mcp.training.run_folder import NORMALISED_RETURN, frames
 from torchrl_mcp.training.update import Agent, Objective, PPOSettings, Update
 
-ENVIRONMENT = "environment"
-"""Name of the state of the trajectory source in a checkpoint."""
-
 
 class RunFolder:
     """Receives the output of a training: metrics, and checkpoints with the configuration.
@@ -71,7 +68,7 @@ class Trainer:
         self.checkpoint: Checkpoint = run_checkpoint(
             agent.parts,
             **{f"{name}_optimizer": optimizer for name, optimizer in objective.optimizers.items()},
-            **{ENVIRONMENT: source},
+            environment=source,
             episodes=self.episodes,
             frozen=agent.frozen,
             progress=self.progress,
@@ -120,7 +117,7 @@ class Trainer:
                 the checkpoint. Nothing is written in these cases.
         """
         components = set(self.checkpoint.components)
-        load(self.checkpoint, path, components if frames(path) else components - {ENVIRONMENT})
+        load(self.checkpoint, path, components if frames(path) else components - {"environment"})
         if not self.source.resumes_episodes:
             self.episodes.load_state_dict(EpisodeStatistics(self.source.num_envs).state_dict())
         self.folder.metrics.rewind(self.progress.iteration)
