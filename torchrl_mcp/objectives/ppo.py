@@ -61,7 +61,7 @@ class ActorLoss(nn.Module):
     log_prob: NestedKey = "action_log_prob"
 
     def set_keys(self, *, action: NestedKey, sample_log_prob: NestedKey) -> None:
-        """Set :attr:`sampled` and :attr:`log_prob`, which TorchRL's losses call ``action`` and ``sample_log_prob``."""
+        """Set ``sampled`` and ``log_prob``, which TorchRL's losses call ``action`` and ``sample_log_prob``."""
         self.sampled = action
         self.log_prob = sample_log_prob
 
