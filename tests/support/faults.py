@@ -606,8 +606,8 @@ FAULTS = {
         ),
         ('if path.startswith("~")', "if False", PLACE),
         (
-            "if steps < (lasting",
-            "if steps < 0 * (lasting",
+            "if steps < steps_per_choice",
+            "if False",
             "runs/test_validation.py::test_a_batch_that_may_contain_no_choice_is_refused",
         ),
         ('if value == "???"', "if False", "runs/test_validation.py::test_a_missing_value_is_asked_for"),
