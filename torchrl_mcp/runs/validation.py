@@ -194,8 +194,8 @@ def _short_batch(training: Mapping[str, Any], factor: int, actor: Mapping[str, A
     steps_per_choice = actor.get("steps_per_choice", 1)
     if steps < steps_per_choice:
         yield (
-            f"steps_per_choice={steps_per_choice} must be at most {steps}, the steps of an environment in a batch: lower "
-            "training.num_envs, or raise training.frames_per_batch"
+            f"steps_per_choice={steps_per_choice} must be at most {steps}, the steps of an environment in a batch: "
+            "lower training.num_envs, or raise training.frames_per_batch"
         )
 
 
